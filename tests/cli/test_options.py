@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scored_dataset import make_dataset, write_description, write_predictions
 
-from fpp_ml_bench.cli import COMMANDS, main, run_command
+from fpp_ml_bench.cli import main, run_command
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.cli.options import WORKING_RANGE, command, command_line, given, names, value
 from fpp_ml_bench.options import REQUIRED, argument, described, did_you_mean, flag_of, option, options_of
@@ -75,11 +75,9 @@ def test_a_command_gets_what_the_line_says_and_defaults_of_its_fields(capsys):
         ("mug --out --dull", "--out: expected a value behind it, got the option --dull"),
         ("mug --out here --conut 3", "unknown option '--conut'; did you mean '--count'?"),
         ("mug --out here --xyz", "unknown option '--xyz'; there are --out, --count"),
-        ("mug --out here --coun 3", "did you mean '--count'"),
         ("mug --out here --count 1.5", "--count 1.5: expected a whole number"),
         ("mug --out here --focal far", "--focal far: expected a number"),
         ("mug --out here --kind tle", "--kind tle: did you mean 'tele'?"),
-        ("mug --out here --kind macro", "--kind macro: there are wide, tele"),
         ("mug --out here --near 5,4", "--near 5,4: expected NEAR,FAR in mm such as 350,450"),
         ("mug x --out here", "N x: expected a whole number"),
         ("mug --out here --dull=1", "does not take a value"),
@@ -117,9 +115,8 @@ def test_fields_describe_themselves():
     assert did_you_mean("x", [f"name {number}" for number in range(200)]).endswith("name 79, ...")
 
 
-@pytest.mark.parametrize("name", sorted({"build", "predict", "time", "train", "stability", "leaderboard", "tradeoff"}))
-def test_almost_right_names_of_options_are_named(name, capsys):
-    assert name in COMMANDS and main([name, "--halp"]) == 2
+def test_almost_right_names_of_options_are_named(capsys):
+    assert main(["build", "--halp"]) == 2
     assert "unknown option '--halp'; did you mean '--help'?" in capsys.readouterr().err
 
 
@@ -171,17 +168,12 @@ def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny, ca
     ("words", "message"),
     [
         (["mine.py:Mine", "--steps"], "a method of yours failed"),
-        (["mine.py:Mine", "--lit", "dark"], "--lit dark: expected a whole number"),
         (
             ["mine.py:Mine", "--frames", "3"],
             "--frames is an option of phase, crossed, not of mine.py:Mine; leave it out",
         ),
         (["mine.py:Clashing"], "its option --split is one of fpp-bench predict; give it another flag"),
         (["mine.py:Min"], "did you mean 'Mine'"),
-        (["phase", "--lit", "3"], "unknown option '--lit'"),
-        (["phase", "--direction", "both"], "--direction both: there are horizontal, vertical"),
-        (["phase", "--direction", "vertcal"], "--direction vertcal: did you mean 'vertical'"),
-        (["phase", "--steps", "3"], "--steps is an option of classical, classical-net, not of phase; leave it out"),
         (["phase", "--frames", "3", "--error-mm", "1"], "--frames and --error-mm: give one of them"),
         (["phas"], "unknown method 'phas'; did you mean 'phase'"),
     ],
@@ -192,14 +184,11 @@ def test_options_of_another_method_are_refused(mine, tiny, capsys, words, messag
     assert message in error and "Traceback" not in error
 
 
-@pytest.mark.parametrize("name", ["phase", "mine.py:Mine", "unet-individual-rmse"])
+@pytest.mark.parametrize("name", ["phase", "mine.py:Mine"])
 def test_the_method_comes_first(mine, tiny, capsys, name):
-    for dataset in (str(tiny), "nowhere"):
-        assert main(["predict", dataset, name, "--out", "out"]) == 2
-        assert (
-            f"expected the method first, then the dataset: fpp-bench predict {name} {dataset}"
-            in capsys.readouterr().err
-        )
+    assert main(["predict", str(tiny), name, "--out", "out"]) == 2
+    said = f"expected the method first, then the dataset: fpp-bench predict {name} {tiny}"
+    assert said in capsys.readouterr().err
 
 
 def test_a_folder_called_as_a_method_is_a_dataset(mine, tiny, capsys):
@@ -219,8 +208,6 @@ def test_a_used_folder_is_refused_before_the_bar(mine, tiny, capsys):
 def test_a_word_that_no_argument_takes_may_be_the_missing_option(mine, capsys):
     assert main(["build", "data/mini"]) == 2
     assert "did you mean --out data/mini?" in capsys.readouterr().err
-    assert main(["build", "--preset", "mini"]) == 2
-    assert "did you mean" not in capsys.readouterr().err
 
 
 def test_help_of_a_command_by_a_word(mine, capsys):
@@ -299,12 +286,6 @@ def test_a_description_by_hand_needs_the_dataset(tmp_path, monkeypatch, capsys):
         in capsys.readouterr().err
     )
     assert score("data")[0] == 0
-    for block in ("text", {"dataset": 3}, {"dataset": "data", "split": "test"}):
-        write_description(tmp_path / "predictions", predicted=block)
-        assert score()[0] == 2 and score("data")[0] == 2  # the second is refused with the description
-    Path("predictions/submission.yaml").unlink()
-    assert score()[0] == 2
-    assert "give the dataset" in capsys.readouterr().err
 
 
 def test_a_slip_in_the_name_of_a_command_is_no_folder(tmp_path, monkeypatch, capsys):
@@ -330,8 +311,6 @@ def test_predictions_of_another_dataset_are_refused(predicted, capsys, tmp_path)
     assert score("other", "--split", "validation") == (2, None)
     error = capsys.readouterr().err
     assert "other: is not what predictions was predicted from, validation/frame_00 is another now" in error
-    assert fpp_eval(["check", "predictions", "other", "--split", "validation"]) == 1
-    assert "other: is not what predictions was predicted from" in capsys.readouterr().out
     description = yaml.safe_load(Path("predictions/submission.yaml").read_text())
     write_description(Path("predictions"), **{**description, "predicted": ...})
     assert score("other", "--split", "validation")[0] == 0  # it says nothing

@@ -1,7 +1,6 @@
 """Coding schemes: patterns in, coordinates out, against `fringes`-free closed forms, OpenCV, and themselves."""
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
-from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image
@@ -26,10 +24,9 @@ CODES = {
     "number-theoretical": {"scheme": "phase-shift", "pitches_px": [29, 33], "steps": 5},
     "own shifts": {"scheme": "phase-shift", "pitch_px": 24, "shifts_deg": [0, 90, 200, 250], "gray": {}},
     "whole-period cells": {"scheme": "phase-shift", "pitch_px": 24, "steps": 4, "gray": {"cell_px": 24}},
-    "inverse pairs": {"scheme": "phase-shift", "pitch_px": 36, "steps": 3, "gray": {"inverse": "after each"}},
+    "inverses": {"scheme": "phase-shift", "pitch_px": 36, "steps": 3, "gray": {"inverse": "after all"}},
     "origin": {"scheme": "phase-shift", "pitches_px": [60, 920], "steps": 4, "origin_px": -3.5},
     "gray alone": {"scheme": "gray", "cell_px": 2},
-    "gray with inverses": {"scheme": "gray", "inverse": "after all", "bits": 11},
     "gray in pairs": {"scheme": "gray", "cell_px": 4, "inverse": "after each", "least_first": True},
     "gray centred": {"scheme": "gray", "cell_px": 1, "bits": 10, "origin_px": -56},
     "cells of another origin": {
@@ -58,21 +55,12 @@ def seen(code, position_px, mean=120.0, amplitude=100.0, noise=0.0, seed=0):
 @pytest.mark.parametrize("name", CODES)
 def test_a_code_gives_its_own_pixels_back(name):
     code, pixels = code_of(name), np.arange(LENGTH, dtype=float)
-    found = code.decode(
-        code.profiles(LENGTH)
-        if not code.needs_flat
-        else np.concatenate(
-            [code.profiles(LENGTH), np.zeros((1, LENGTH), np.uint8), np.full((1, LENGTH), 255, np.uint8)]
-        ),
-        LENGTH,
-        Limits(max_clipped_steps=20),
-    )
-    assert (found.reason == Reason.DECODED).mean() > (0.9 if name == "whole-period cells" else 0.99)
-    good = found.reason == 0
+    found = code.decode(seen(code, pixels, 127.5, 127.5), LENGTH, Limits(max_clipped_steps=20))
+    good = found.reason == Reason.DECODED
+    assert good.mean() > (0.9 if name == "whole-period cells" else 0.99)
     # 8-bit patterns are rounded to half a grey level of 127.5; a cell knows its pixels to half its width.
     bound = code.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
     assert np.abs(found.coordinate_px - pixels)[good].max() <= bound
-    assert len(code.shown) == len(code.profiles(LENGTH))
     assert code.step_px == (bound if isinstance(code, GrayOnly) else 0)
 
 
@@ -88,20 +76,6 @@ def test_noise_is_what_the_code_says_and_no_order_slips(name):
     assert np.sqrt(np.mean(error**2)) == pytest.approx(stated * math.hypot(1, rounding), rel=0.2)
 
 
-def test_the_papers_code_is_one_of_them_bit_for_bit(monkeypatch):
-    from fpp_ml_bench.decoding.blocks import plan_direction
-
-    rig = paper_rig(64)
-    code, plan = rig.code("vertical"), plan_direction(rig, "vertical", None)
-    assert isinstance(code, PhaseShift) and code.is_plain and code == code_of("the paper's")
-    levels = np.clip(np.rint(seen(code, np.random.default_rng(0).uniform(0, 911, 4000), noise=2)), 0, 255)
-    levels = levels.astype(np.uint8)
-    compiled, general = plan.decode(levels, LIMITS), code.decode(levels, 912, LIMITS)
-    good = compiled.reason == 0
-    assert good.mean() > 0.98 and np.mean(general.reason == compiled.reason) > 0.999
-    np.testing.assert_allclose(general.coordinate_px[good], compiled.coordinate_px[good], atol=1e-11)
-
-
 def test_gray_frames_are_opencvs():
     frames = GrayCells(1, 10, "after each").profiles(912)
     generator = cv2.structured_light.GrayCodePattern.create(912, 4)
@@ -115,27 +89,16 @@ def test_cells_begin_at_their_origin_and_either_bit_comes_first():
     centred, usual = GrayCells(1, 10, origin_px=-56).profiles(912), GrayCells(1, 10).profiles(1024)
     assert np.array_equal(centred, usual[:, 56:968])
     assert np.array_equal(GrayCells(1, 10, least_first=True).profiles(1024), usual[::-1])
-    pairs = [GrayCells(1, 10, "after each", least_first=least).profiles(912) for least in (False, True)]
-    assert np.array_equal(pairs[1].reshape(10, 2, -1), pairs[0].reshape(10, 2, -1)[::-1])
     # 3 px per cell from -4: pixels 0 and 1 are the rest of cell 1, and the last pixel is alone in cell 305.
     cells = GrayCells.from_entries({"cell_px": 3, "origin_px": -4}, LENGTH)
     assert cells.bits == 9 and cells.centre_px(np.array([0, 1, 2, 305, 306]), LENGTH)[1:4].tolist() == [0.5, 3, 911]
     assert np.isnan(cells.centre_px(np.array([0, 306]), LENGTH)).all()
-    assert GrayCells.from_entries({"origin_px": -113}, LENGTH, 1.0).bits == 11  # 1025 cells
 
 
 def test_a_rig_dictionary_names_only_what_is_unusual():
-    assert GrayCells(2, 9).to_dict() == {"cell_px": 2, "bits": 9, "inverse": "none"}
-    assert GrayCells(2, 9, "none", -3.0, True).to_dict() == {
-        "cell_px": 2,
-        "bits": 9,
-        "inverse": "none",
-        "origin_px": -3.0,
-        "least_first": True,
-    }
-    plain = code_of("the paper's")
-    for change in ({"origin_px": -9.0}, {"least_first": True}):
-        assert not replace(plain, gray=replace(plain.gray, **change)).is_plain
+    usual = {"cell_px": 2, "bits": 9, "inverse": "none"}
+    assert GrayCells(2, 9).to_dict() == usual
+    assert GrayCells(2, 9, "none", -3.0, True).to_dict() == {**usual, "origin_px": -3.0, "least_first": True}
 
 
 def test_pairs_need_no_white_and_black():
@@ -219,14 +182,10 @@ def test_single_frames_are_described_and_made_but_not_decoded_pixel_by_pixel():
 @pytest.mark.parametrize(
     "sequence, said",
     [
-        ({}, "pitch_px"),
         ({"order": ["vertical"]}, "no direction is coded"),
         ({"vertical": {"scheme": "magic"}}, "vertical.scheme: expected phase-shift, gray"),
-        ({"vertical": 3}, "vertical: expected a mapping"),
-        ({"vertical": {"scheme": "phase-shift", "steps": 3}}, "pitches_px: expected a list"),
         ({"vertical": {"scheme": "phase-shift", "pitch_px": 18}}, "steps: missing"),
         ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": 0}}, "sign: expected 1"),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 2, "steps": 3}}, "expected 4 px and more"),
         ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "colour": 1}}, "colour: unknown key"),
         ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "shifts_deg": [0], "steps": 3}}, "not both"),
         ({"vertical": {"scheme": "phase-shift", "pitches_px": [18, 36], "steps": [3]}}, "each of 2 periods"),
@@ -236,12 +195,8 @@ def test_single_frames_are_described_and_made_but_not_decoded_pixel_by_pixel():
         ({"vertical": {"scheme": "gray"}, "order": ["vertical"]}, "black, white missing"),
         ({"vertical": {"scheme": "gray", "origin_px": 1}}, "vertical.origin_px: expected 0 or less"),
         ({"vertical": {"scheme": "gray", "origin_px": -113, "bits": 10}}, "hold 1025 Gray cells.*need 11 bits"),
-        ({"vertical": {"scheme": "gray", "least_first": 1}}, "least_first: expected true or false"),
         ({"vertical": CODES["unit cue"], "order": ["vertical", "vertical"]}, "at most once"),
-        ({"vertical": CODES["unit cue"], "order": "vertical"}, "expected a list of names"),
         ({"vertical": CODES["unit cue"], "order": ["horizontal"]}, "expected each of vertical, black, white"),
-        ({"vertical": CODES["unit cue"], "diagonal": {}}, "diagonal: unknown key"),
-        ({"vertical": CODES["unit cue"], "order": ["crossed"]}, "expected each of vertical, black, white"),
         ({"vertical": {"scheme": "composite", "pitches_px": [18]}}, "two periods and more"),
         ({"vertical": {"scheme": "composite", "pitches_px": [18, 2]}}, "4 px and more"),
     ],

@@ -6,7 +6,7 @@ import pytest
 from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.optics.named_rigs import CROSSED, crossed_rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image, pattern_profile
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
@@ -36,25 +36,10 @@ def test_each_frame_is_the_sum_of_two_shifted_carriers():
     np.testing.assert_allclose(np.hypot(g_u, g_v), 1 / 14.5)
 
 
-def test_three_shifts_of_one_carrier_hold_the_other_still():
-    family = Crossed((18.0, 14.0), shifts_deg=CROSSED["crossed-18"].shifts_deg)
-    images = np.stack([family.image(60, 70, n) for n in range(3)]).astype(float)
-    wave = np.tensordot(np.exp(-2j * np.pi * np.arange(3) / 3), images, 1) * 2 / 3
-    (_, f_v), (g_u, _) = family.cycles_per_px
-    rows = np.angle(wave * np.exp(-2j * np.pi * f_v * np.arange(70))[:, None])
-    assert np.abs(rows).max() < 0.02  # of rounding to 8 bits
-    np.testing.assert_allclose(
-        images.mean(axis=0),
-        np.broadcast_to(127.5 + 63.75 * np.cos(2 * np.pi * g_u * np.arange(60)), (70, 60)),
-        atol=0.51,
-    )
-
-
 def test_a_rig_file_holds_crossed_fringes_beside_codes_or_alone(tmp_path):
     wave = {"scheme": "phase-shift", "pitch_px": 57, "steps": 3}
     for sequence in (
         {"crossed": FAMILY},
-        {"order": ["white", "crossed"], "crossed": {"pitches_px": [18, 14]}},
         {"order": ["crossed", "vertical", "black"], "crossed": FAMILY, "vertical": wave},
     ):
         rig = rig_from_dict(rig_of(**sequence))
@@ -65,7 +50,6 @@ def test_a_rig_file_holds_crossed_fringes_beside_codes_or_alone(tmp_path):
         assert rig.sequence.config("single_shot") == indices[:1]
         for n, index in enumerate(indices):
             assert np.array_equal(pattern_image(rig, index), rig.crossed.image(912, 1140, n))
-            assert rig.sequence.frames[index].title == f"{index}: crossed fringes, step {n}"
     alone: Rig = rig_from_dict(rig_of(crossed=FAMILY))
     assert alone.directions == () and alone.crossed == Crossed.from_entries(FAMILY)
     with pytest.raises(DecodeError, match="crossed fringes alone can't be decoded"):
@@ -92,15 +76,12 @@ def test_the_crossed_rig_is_the_papers_with_three_frames_before_its_own():
 
 
 def test_a_pair_of_frames_makes_the_crossed_frame_of_its_family():
-    rig = paper_rig()
-    family = Crossed.of_pair(rig)
-    assert family == Crossed((18.0, 18.0))
-    made = crossed_from_pair(pattern_image(rig, 0), pattern_image(rig, 18))
-    assert made.dtype == np.uint8 and np.abs(made.astype(int) - family.image(912, 1140, 0)).max() <= 1
+    assert Crossed.of_pair(paper_rig()) == Crossed((18.0, 18.0))
     wave = {"scheme": "phase-shift", "pitch_px": 57, "shifts_deg": [30, 150, 270], "origin_px": 5}
     rig = rig_from_dict(rig_of(horizontal=wave, vertical={**wave, "pitch_px": 48, "origin_px": 0}))
-    made = crossed_from_pair(pattern_image(rig, 0), pattern_image(rig, 3)).astype(int)
-    assert np.abs(made - Crossed.of_pair(rig).image(912, 1140, 0)).max() <= 1
+    made = crossed_from_pair(pattern_image(rig, 0), pattern_image(rig, 3))
+    assert made.dtype == np.uint8
+    assert np.abs(made.astype(int) - Crossed.of_pair(rig).image(912, 1140, 0)).max() <= 1
     with pytest.raises(RigError, match="two uint8 images"):
         crossed_from_pair(np.zeros((3, 4)), np.zeros((3, 4), np.uint8))
 
@@ -109,13 +90,9 @@ def test_a_pair_of_frames_makes_the_crossed_frame_of_its_family():
     "changes, said",
     [
         ({"pitches_px": [18, 2]}, "crossed.pitches_px: expected 4 px and more"),
-        ({"pitches_px": 18}, "crossed.pitches_px: expected 2 numbers"),
-        ({"pitches_px": [18, float("nan")]}, r"crossed.pitches_px\[1\]: expected a finite number"),
         ({"pitches_px": [18, 3000]}, "exceeds the pattern of 912 x 1140 px"),
         ({"angles_deg": [0, 182]}, "0 and 182 degrees are parallel"),
-        ({"angles_deg": [-179, 2]}, "are parallel"),
         ({"weights": [0.7, 0.4]}, "weights: expected two above 0 with a sum of at most 1"),
-        ({"weights": [1, 0]}, "weights: expected two above 0"),
         ({"shifts_deg": []}, "a pair of degrees for each frame"),
         ({"shifts_deg": [[0, 0], [120]]}, r"shifts_deg\[1\]: expected 2 numbers"),
         ({"steps": 3}, "crossed.steps: unknown key"),

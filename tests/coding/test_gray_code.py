@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.coding.gray_code import (
@@ -28,20 +26,13 @@ def test_code_is_the_reflected_code():
     assert gray_to_binary(code).tolist() == list(range(1024))
 
 
-@given(st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=50))
-def test_code_round_trips(values):
-    assert gray_to_binary(binary_to_gray(values)).tolist() == values
-
-
 @pytest.mark.parametrize(
     "length, pitch, cells, bits",
     [
         (912, 18, 102, 7),
-        (1140, 18, 127, 7),
         (1140, 17, 135, 8),
         (1152, 18, 128, 7),
         (1153, 18, 129, 8),
-        (8, 8, 2, 1),
         (64, 12.8, 10, 4),
     ],
 )
@@ -59,49 +50,44 @@ def test_centres_are_the_means_of_the_pixels(pitch):
     np.testing.assert_allclose(cell_centres_rad(length, pitch), expected, atol=1e-12)
 
 
-def captured_at(u, pitch, length, steps, blur_px, noise, modulation, seed, gray_shift_px=0.0):
-    """Frames at sub-pixel positions u, (frames, 1, n): interpolated and box-blurred as by a camera pixel.
-
-    ``gray_shift_px`` displaces the code against the sinusoids, as a misread edge would.
-    """
-    rng = np.random.default_rng(seed)
-    bits = bits_needed(length, pitch)
-    w = np.arange(length)
-    gray = binary_to_gray(cell_of(w, pitch))
-    sinusoids = [127.5 + 127.5 * np.cos(2 * np.pi * (w / pitch + n / steps)) for n in range(steps)]
-    codes = [(gray >> (bits - 1 - b) & 1) * 255.0 for b in range(bits)]
-    offsets = np.linspace(-blur_px / 2, blur_px / 2, 9)
-    scale = modulation / 127.5
-    images = []
-    for profile, shift in [(np.rint(s), 0.0) for s in sinusoids] + [(c, gray_shift_px) for c in codes]:
-        grey = np.mean([np.interp(u + o + shift, w, profile) for o in offsets], axis=0)
-        images.append(np.rint(10 + scale * grey + noise * rng.standard_normal(u.shape)))
-    return np.clip(np.stack(images)[:, None, :], 0, 255)
-
-
 def decoded(levels, pitch, length, steps):
     """What the code of a period in equal steps and Gray code in half periods makes of grey levels (frames, n)."""
-    code = PhaseShift((Fringes(pitch, equal_shifts(steps, 1)),), 0.0, GrayCells(pitch / 2, len(levels) - steps))
-    return code.decode(levels, length, Limits())
+    return code_of(pitch, len(levels) - steps, steps).decode(levels, length, Limits())
 
 
-@pytest.mark.parametrize("pitch, length", [(18, 912), (18, 1140), (12.8, 400), (6, 200)])
+def code_of(pitch, bits, steps):
+    return PhaseShift((Fringes(pitch, equal_shifts(steps, 1)),), 0.0, GrayCells(pitch / 2, bits))
+
+
+def captured_at(u, pitch, blur_px, noise, modulation, gray_shift_px=0.0):
+    """Grey levels (frames, n) at sub-pixel positions u of 18 steps and the code, box-blurred as by a camera pixel; the
+    code is displaced by ``gray_shift_px`` against the sinusoids, as a misread edge would be."""
+    profiles = code_of(pitch, bits_needed(912, pitch), 18).profiles(912)
+    levels = []
+    for row, profile in enumerate(profiles):
+        at = u + (gray_shift_px if row >= 18 else 0.0)
+        offsets = blur_px * np.linspace(-0.5, 0.5, 9)
+        levels.append(np.mean([np.interp(at + offset, np.arange(912), profile) for offset in offsets], axis=0))
+    error = noise * np.random.default_rng(1).standard_normal((len(levels), u.size))
+    return np.clip(np.rint(10 + modulation / 127.5 * np.array(levels) + error), 0, 255)
+
+
+@pytest.mark.parametrize("pitch", [18, 12.8, 6])
 @pytest.mark.parametrize("blur_px, noise, modulation", [(0.0, 1.0, 60.0), (1.5, 2.0, 40.0), (3.0, 1.5, 25.0)])
-def test_no_position_ever_slips_a_period(pitch, length, blur_px, noise, modulation):
-    u = np.arange(2, length - 3, 0.0137)
-    images = captured_at(u, pitch, length, 18, blur_px, noise, modulation, seed=1)
-    measured = decoded(images[:, 0], pitch, length, 18)
-    trusted = measured.reason == 0
+def test_no_position_ever_slips_a_period(pitch, blur_px, noise, modulation):
+    u = np.arange(2, 909, 0.0137)
+    measured = decoded(captured_at(u, pitch, blur_px, noise, modulation), pitch, 912, 18)
+    trusted = measured.reason == Reason.DECODED
     assert np.abs(measured.coordinate_px - u)[trusted].max() < pitch / 8  # an order wrong by 1 is a whole pitch
     assert trusted.mean() > 0.999
 
 
-@pytest.mark.parametrize("shift", [-4.0, -3.0, -1.0, 1.0, 3.0, 4.0])
+@pytest.mark.parametrize("shift", [-4.0, 4.0])
 def test_code_edges_may_be_off_by_almost_a_quarter_period(shift):
     """Misread cells at the edges: displaced by up to 4 px of 18, under a quarter period (4.5 px), no order is wrong."""
     u = np.arange(6, 900, 0.05)
-    images = captured_at(u, 18, 912, 18, 1.0, 0.5, 60.0, seed=2, gray_shift_px=shift)
-    assert np.abs(decoded(images[:, 0], 18, 912, 18).coordinate_px - u).max() < 1.0
+    measured = decoded(captured_at(u, 18, 1.0, 0.5, 60.0, gray_shift_px=shift), 18, 912, 18)
+    assert np.abs(measured.coordinate_px - u).max() < 1.0
 
 
 def test_a_single_ambiguous_bit_is_trusted_only_at_its_edge():
@@ -117,16 +103,6 @@ def test_a_single_ambiguous_bit_is_trusted_only_at_its_edge():
             assert trusted[0, 0] == (abs(int(neighbour) - cell) == 1)
             frames[(blurred + 1) % bits] = 101
             assert not decode_cells(frames, mean, modulation)[1].any()  # two ambiguous bits are never trusted
-
-
-@given(cell=st.integers(0, 101), offset=st.floats(-0.49, 0.49))
-@settings(max_examples=200, deadline=None)
-def test_consistent_pairs_are_kept_and_give_the_position(cell, offset):
-    centres = cell_centres_rad(912, 18)
-    phase = centres[cell] + offset * np.pi
-    measured = decoded(levels_of(np.array([phase]), np.array([cell])), 18, 912, 4)
-    assert measured.reason[0] in (0, Reason.OUTSIDE_PATTERN)  # the last cell ends beyond it
-    assert measured.coordinate_px[0] == pytest.approx(phase * 9 / np.pi, abs=1e-9)
 
 
 def test_phase_on_the_far_side_of_the_circle_and_cells_off_the_pattern_are_rejected():

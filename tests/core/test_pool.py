@@ -59,6 +59,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.processes
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are killed by a signal")
 def test_no_worker_outlives_its_parent(tmp_path):
     (tmp_path / "waiting.py").write_text(_WAITING)
@@ -98,20 +99,3 @@ def test_an_address_where_nobody_answers(fake_ray, tmp_path, capsys):
     assert fake_ray.addresses == []
     assert main([*words, "--cluster", "x", "--workers", "2"]) == 2
     assert "give one of them" in capsys.readouterr().err
-
-
-def test_without_ray_the_extra_is_named(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    words = [
-        "build",
-        "--out",
-        str(tmp_path / "set"),
-        "--objects",
-        "cork",
-        "--size",
-        "176",
-        "--cluster",
-        "ray://head:10001",
-    ]
-    assert main(words) == 2
-    assert "this needs ray, which is not installed; pip install 'fpp-ml-bench[cluster]'" in capsys.readouterr().err

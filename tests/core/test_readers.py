@@ -100,9 +100,11 @@ def refusal(source, content):
     return str(error.value)
 
 
-@pytest.mark.parametrize("name", YAML)
-@pytest.mark.parametrize("attack", TEXTS)
+@pytest.mark.parametrize(
+    ("name", "attack"), [*(("rig", attack) for attack in TEXTS), *((name, "key twice") for name in YAML[1:])]
+)
 def test_hostile_yaml(name, attack, valid):
+    """All attacks on one file, and one on each of the others: they have the same reader."""
     text, message = TEXTS[attack]
     assert re.search(message, refusal(valid[name], text))
 
@@ -137,9 +139,12 @@ JSON_TEXTS = {
 }
 
 
-@pytest.mark.parametrize("name", JSON)
-@pytest.mark.parametrize("attack", JSON_TEXTS)
+@pytest.mark.parametrize(
+    ("name", "attack"),
+    [*(("rig as JSON", attack) for attack in JSON_TEXTS), *((name, "key twice") for name in JSON[1:])],
+)
 def test_hostile_json(name, attack, valid):
+    """All attacks on one file, and one on each of the others: they have the same reader."""
     text, message = JSON_TEXTS[attack]
     assert re.search(message, refusal(valid[name], text))
 
@@ -182,8 +187,13 @@ def endpoint(path):
 NO_FILES = {"pipe": fifo, "device": device, "folder": lambda path: path.mkdir(), "socket": endpoint}
 
 
-@pytest.mark.parametrize("kind", NO_FILES)
-@pytest.mark.parametrize("name", (*YAML, *JSON, "weights", "calibration", "mask"))
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *(("rig", kind) for kind in NO_FILES),
+        *((name, "pipe") for name in (*YAML[1:], *JSON, "weights", "calibration", "mask")),
+    ],
+)
 def test_what_is_no_regular_file_is_refused_at_once(name, kind, valid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     others = {
@@ -221,7 +231,7 @@ def test_a_file_that_the_user_names_may_be_a_link_and_one_in_a_folder_of_predict
 
 def test_files_are_bounded_before_they_are_read(tmp_path):
     """A sparse file: no disk is used, and reading it whole would take seconds."""
-    for name, size in (("rig.yaml", 1 << 40), ("rig.json", 1 << 40), ("c.xml", 1 << 40)):
+    for name, size in (("rig.yaml", 1 << 40), ("c.xml", 1 << 40)):
         with (tmp_path / name).open("wb") as file:
             file.truncate(size)
         read = read_opencv_calibration if name == "c.xml" else load_rig
@@ -256,28 +266,15 @@ MANIFESTS = {
     "sample is a path": (first_row(sample="../../x"), "sample '../../x': expected a name of letters"),
     "object is a path": (first_row(object="/etc/passwd"), "object '/etc/passwd': expected a name"),
     "view is a path": (first_row(view="../x"), "view '../x': expected a name"),
-    "sample with markup": (first_row(sample="<b>_A0"), "sample '<b>_A0': expected a name"),
-    "sample of two lines": (first_row(sample="a_A0\n"), "expected a name"),
     "sample too long": (first_row(sample=300 * "a" + "_A0"), "expected a name"),
-    "sample is a number": (first_row(sample=5), "sample '5': expected a name"),
     "no object": (lambda content: content["samples"]["test"][0].pop("object"), "object 'None': expected a name"),
     "pixels are text": (first_row(object_px="many"), "object_px: expected a number, got many"),
-    "no depth": (first_row(depth_min_mm=None), "depth_min_mm: expected a number"),
     "error is a list": (first_row(gt_mae_mm=[]), "gt_mae_mm: expected a number"),
     "shard outside": (first_shard(path="../../etc/passwd"), "without . and .."),
-    "shard absolute": (first_shard(path="/etc/passwd"), "'/etc/passwd': expected a relative path"),
-    "shard with backslash": (first_shard(path="train\\x"), "expected a relative path"),
-    "shard with empty part": (first_shard(path="train//x"), "expected a relative path"),
-    "shard by a dot": (first_shard(path="./x"), "expected a relative path"),
-    "shard of nothing": (first_shard(path=""), "expected a relative path"),
-    "shard is the folder": (first_shard(path="."), "expected a relative path"),
     "shard with an escape": (first_shard(path="train/\x1b[31m"), r"U\+001B"),
-    "shard of a number": (first_shard(path=5), "shards path: expected str, got 5"),
     "rows below 0": (first_shard(rows=-1), "expected counts of 0 and more"),
-    "rows of true": (first_shard(rows=True), "shards rows: expected int, got True"),
     "no hash": (first_shard(xxh3_128="x"), "a hash of 32 hex digits"),
     "another key": (first_shard(x=1), "shards: expected exactly the keys path, split"),
-    "shard of no split": (first_shard(split="holdout"), "unknown split 'holdout'"),
     "shard of no group": (first_shard(group="x"), "unknown group 'x', expected data"),
     "shard twice": (lambda content: content["shards"].append(content["shards"][0]), "is listed twice"),
     "other file outside": (lambda content: content["others"][0].update(path="../x"), "without . and .."),
@@ -286,12 +283,8 @@ MANIFESTS = {
         "unknown split 'holdout'",
     ),
     "empty split": (lambda content: content["samples"].update(test=[]), "expected some in every split"),
-    "no samples": (lambda content: content.update(samples={}), "expected some in every split"),
-    "samples are a list": (lambda content: content.update(samples=[]), "samples: expected"),
     "image of no size": (lambda content: content.update(size=[0, 16]), r"expected 1 to 16384 px a side"),
     "image too large": (lambda content: content.update(size=[12, 16385]), r"expected 1 to 16384 px a side"),
-    "three sides": (lambda content: content.update(size=[12, 16, 3]), "size: expected tuple"),
-    "no rig": (lambda content: content.update(rig={}), "camera: missing"),
     "another rig": (lambda content: content["rig"]["camera"].update(fx="wide"), "camera.fx: expected a number"),
     "stored nothing": (lambda content: content.update(stored="crossed"), "'crossed' is no configuration"),
     "exact is a number": (lambda content: content.update(exact=1), "exact: expected bool, got 1"),
@@ -326,11 +319,7 @@ def test_no_command_writes_or_reads_outside_by_a_manifests_names(copied, tmp_pat
     out = tmp_path / "here" / "out"
     for command in (
         ["predict", "phase", copied, "--split", "train", "--out", out],
-        ["verify", copied],
-        ["info", copied],
-        ["export", copied, "--out", out, "--mat"],
         ["export", copied, "--out", out, "--parquet"],
-        ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
     ):
         assert main([str(word) for word in command]) == 2, command
         assert "manifest.json: damaged (sample '../../x'" in capsys.readouterr().err, command
@@ -344,10 +333,7 @@ def test_no_command_follows_a_link_out_of_the_dataset(copied, tmp_path, capsys):
     out = tmp_path / "here" / "out"
     for command in (
         ["predict", "phase", copied, "--split", "train", "--out", out],
-        ["verify", copied],
-        ["info", copied],
         ["export", copied, "--out", out, "--parquet"],
-        ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
     ):
         assert main([str(word) for word in command]) == 2, command
         assert f"{shard}: is a link out of the dataset" in capsys.readouterr().err, command
@@ -389,27 +375,26 @@ def test_rows_without_end_are_a_finding_at_once(copied):
 def test_a_receipt_that_no_shard_left_is_as_none(value, tmp_path):
     planned = assembly({"train": ("bowl",)})
     (plan,) = planned.plans
-    (tmp_path / "set").mkdir()
-    written = ShardWriter(planned.manifest).write(tmp_path / "set", plan, planned.rows(plan, tmp_path))
+    written = ShardWriter(planned.manifest).write(tmp_path, plan, planned.rows(plan, tmp_path))
     good, rows = asdict(written), written.rows
     receipt = tmp_path / "receipt.json"
-    receipt.write_text(json.dumps(good))
-    assert planned_receipt(receipt, plan) == written
-    assert planned_receipt(receipt, replace(plan, index=1)) is None  # a shard of another name
-    for key in ("path", "split", "group", "xxh3_128"):
-        receipt.write_text(json.dumps({**good, "files": [{**good["files"][0], key: value}]}))
-        assert planned_receipt(receipt, plan) is None
-    for key in ("sample", "object", "view", "hashes", "object_px"):
-        fits = {"hashes": isinstance(value, dict), "object_px": type(value) in (int, float)}
-        if not fits.get(key):
-            receipt.write_text(json.dumps({**good, "rows": [{**rows[0], key: value}, *rows[1:]]}))
-            assert planned_receipt(receipt, plan) is None, key
-    for content in (value, *({**good, key: value} for key in good)):
+
+    def read(content):
         receipt.write_text(json.dumps(content))
-        assert planned_receipt(receipt, plan) is None or (value == [] and [] in (content["files"], content["meshes"]))
+        return planned_receipt(receipt, plan)
+
+    assert read(good) == written
+    assert planned_receipt(receipt, replace(plan, index=1)) is None  # a shard of another name
+    assert read(value) is None
+    assert read({**good, "files": [{**good["files"][0], "path": value}]}) is None
+    for key in ("sample", "object", "view"):
+        assert read({**good, "rows": [{**rows[0], key: value}, *rows[1:]]}) is None, key
+    if value != []:
+        for key in good:
+            assert read({**good, key: value}) is None, key
 
 
-@pytest.mark.parametrize("text", ["[]", "{", '"x"', '{"size": NaN}'])
+@pytest.mark.parametrize("text", ["[]", "{"])
 def test_damaged_settings_of_a_build_are_refused(text, tmp_path):
     planned = assembly({"train": ("bowl",)})
     (tmp_path / "set" / ".build").mkdir(parents=True)
@@ -427,7 +412,7 @@ def test_paths_that_name_nothing_below_a_folder(path, tmp_path):
         RemoteFolder(f"file://{tmp_path}").get(path, tmp_path / "x")
 
 
-@pytest.mark.parametrize("stem", ["x" * 120, "a b", "<b>", "-a", "x\x1b[31m"])
+@pytest.mark.parametrize("stem", ["x" * 120, "<b>"])
 def test_published_files_have_names_that_a_dataset_may_have(stem, tmp_path):
     make_tree(tmp_path, splits={"train": ("bowl",), "val": (stem,)})
     with pytest.raises(LayoutError, match="expected a name like power_drill_A60"):

@@ -2,23 +2,17 @@
 
 import numpy as np
 import pytest
-import trimesh
 from captures import LENSES, PAPER, TURNED, capture, tilted
-from conftest import TINY_SIZE, file_bytes, tiny_settings
+from conftest import TINY_SIZE, tiny_settings
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.run import captured_frames
-from fpp_ml_bench.coding.code import Limits, Reason
+from fpp_ml_bench.coding.code import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.light import named_light
-from fpp_ml_bench.loaders.render.lighting import Lighting
-from fpp_ml_bench.loaders.render.projector import PatternLight
-from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import SolidMesh, place
+from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.sensor import Exposure
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
 
 
@@ -33,17 +27,6 @@ def test_the_switch_is_the_environment_and_comes_back(monkeypatch):
     assert skipping_enabled()
     monkeypatch.setenv(SWITCH, "0")
     assert not skipping_enabled()
-
-
-@pytest.mark.parametrize("change", [{}, {"light": named_light("workshop"), "stored": "single_shot"}])
-def test_a_build_gives_the_same_files_with_skipping_off(tmp_path, change):
-    settings = tiny_settings(objects=("power_drill",), **change)
-    build(tmp_path / "on", settings, workers=1)
-    with skipping(False):
-        build(tmp_path / "off", settings, workers=1)
-    skipped, whole = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
-    assert sorted(skipped) == sorted(whole) and sum(name.endswith(".arrow") for name in skipped) in (1, 4)
-    assert [name for name in skipped if skipped[name] != whole[name]] == []
 
 
 SHADY = named_light("paper").changed("bounces", shadows=True, interreflection=False, ambient_occlusion=False)
@@ -82,26 +65,6 @@ def test_what_the_manifest_says_is_what_was_traced_and_exposed(tmp_path, monkeyp
         build(tmp_path / "off", settings, workers=1)
     assert counts["rays"] > 2 * traced
     assert counts["exposed"] == sum(52 * (pixels + row["exact_px"]) for row in rows)
-
-
-def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
-    rig = paper_rig(TINY_SIZE)
-    pattern = PatternLight.of(rig, SHADY.projector)
-    ball = trimesh.creation.icosphere(3, 0.15)
-    mesh = SolidMesh("ball", np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
-    traced = TracedObject(mesh, place(mesh, "A0", rig, "fixed", 1)[0])
-    covered = traced.primary(PixelRays.of(rig.camera)).pixels
-    backdrop, counts = Lighting(rig, SHADY, pattern), counting(monkeypatch)
-    fewer = backdrop.behind(traced, covered)
-    traced_rays = counts["rays"]
-    with skipping(False):
-        every = backdrop.behind(traced, covered)
-    assert 0 < traced_rays == fewer.shadow_rays == every.shadow_rays < 0.3 * (counts["rays"] - traced_rays)
-    elsewhere = np.ones(TINY_SIZE**2, dtype=bool)
-    elsewhere[covered] = False
-    np.testing.assert_array_equal(fewer.gain[elsewhere], every.gain[elsewhere])
-    unshaded = Lighting(rig, named_light("paper"), pattern).behind(traced, covered).gain
-    assert ((fewer.gain == 0) & (unshaded > 0))[elsewhere].sum() > 100
 
 
 # ---- decoding
@@ -156,34 +119,6 @@ def test_no_pixel_near_the_ends_of_the_range_is_lost(disagreement):
         np.testing.assert_array_equal(alone.depth_mm, everything.depth_mm)
 
 
-def test_inside_a_mask_the_bytes_are_those_of_the_whole_image():
-    frames, seen = sparse(PAPER)
-    mask = seen.copy()
-    mask[:, ::3] = False
-    whole = decode_stack(frames, PAPER)
-    for reasons in (True, False):
-        part = decode_stack(frames, PAPER, mask=mask, reasons=reasons)
-        np.testing.assert_array_equal(part.depth_mm, np.where(mask, whole.depth_mm, 0))
-        assert part.counts["not_asked"] == (~mask).sum()
-    # Frames in which everything outside the mask is destroyed: nothing there is looked at.
-    destroyed = [np.where(mask, frame, 255 - frame).astype(np.uint8) for frame in frames]
-    np.testing.assert_array_equal(decode_stack(destroyed, PAPER, mask=mask).depth_mm, part.depth_mm)
-
-
-@pytest.mark.parametrize("share", [0.2, 0.9])
-def test_a_mask_costs_nothing_in_exactness_however_much_it_covers(share):
-    frames = capture(PAPER, tilted(PAPER))
-    mask = np.zeros(tilted(PAPER).shape, dtype=bool)
-    mask[: int(share * len(mask))] = True
-    whole = decode_stack(frames, PAPER)
-    with skipping(False):
-        off = decode_stack(frames, PAPER, mask=mask)
-    for decoded in (off, decode_stack(frames, PAPER, mask=mask)):
-        np.testing.assert_array_equal(decoded.depth_mm, np.where(mask, whole.depth_mm, 0))
-        np.testing.assert_array_equal(decoded.reason, np.where(mask, whole.reason, Reason.NOT_ASKED))
-        assert sum(decoded.counts.values()) == mask.size and decoded.counts["not_asked"] == (~mask).sum()
-
-
 def test_an_image_without_object_never_reads_the_second_direction():
     frames = capture(PAPER, np.full((PAPER.camera.height, PAPER.camera.width), 3.2))
     decoded = decode_stack(frames, PAPER, reasons=False, threads=2)
@@ -193,12 +128,7 @@ def test_an_image_without_object_never_reads_the_second_direction():
 # ---- reading
 
 
-def test_frames_that_a_method_does_not_use_are_not_read(tiny):
-    opened = DatasetFolder(tiny)
+def test_frames_that_a_method_does_not_use_are_not_read(opened):
     method = ClassicalMethod(opened.rig, direction="vertical", steps=3)
-    sample = opened.samples("test")[0]
-    frames = captured_frames(opened, method, sample)
+    frames = captured_frames(opened, method, opened.samples("test")[0])
     assert [i for i, frame in enumerate(frames) if frame is not None] == list(method.frames_used)
-    read = {path: file._starts for path, file in opened._opened.items()}  # no other files are opened
-    groups = {"/".join(path.split("/")[-2:]).split("-")[0] for path in read}
-    assert groups == {"test/vertical", "test/codes"} and sum(map(len, read.values())) == len(method.frames_used) == 10

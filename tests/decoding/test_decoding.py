@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from captures import LENSES, PAPER, TURNED, capture, tilted
 
-from fpp_ml_bench.baselines.stability.frames import coded_rig, direction_levels, plane_stack, sinusoids
+from fpp_ml_bench.baselines.stability.frames import coded_rig, direction_levels, plane_stack
 from fpp_ml_bench.coding.code import Limits, Reason
-from fpp_ml_bench.coding.gray_code import binary_to_gray
 from fpp_ml_bench.decoding.blocks import plan_direction
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_noise_mm
@@ -43,29 +42,12 @@ def test_depth_error_is_the_noise_it_must_have(rig, direction):
     assert np.median(core) == pytest.approx(0.6745, rel=0.06)
 
 
-@pytest.mark.parametrize("direction", ["vertical", "both"])
-def test_error_follows_one_over_root_n(direction):
-    depth = tilted(PAPER)
-    frames = capture(PAPER, depth, noise=1.5)
-    errors = {}
-    for steps in (3, 4, 6, 9, 18):
-        decoded = decode_stack(frames, PAPER, direction, steps=steps)
-        good = decoded.depth_mm > 0
-        errors[steps] = np.median(np.abs(decoded.depth_mm - depth * 1000)[good]) * np.sqrt(steps)
-        per_direction = 2 if direction == "both" else 1
-        assert len(decoded.frames_used) == per_direction * (steps + 7)
-    mean = np.mean(list(errors.values()))
-    # N = 4 of 18 is not quite even: its shifts are 0, 100, 180 and 280 degrees.
-    assert all(error == pytest.approx(mean, rel=0.08) for error in errors.values()), errors
-
-
 @pytest.mark.parametrize(
     "code",
     [
-        *({"cell_px": cell} for cell in (2, 4, 8, 16)),
-        *({"cell_px": cell, "inverse": inverse} for cell in (2, 16) for inverse in ("after each", "after all")),
+        {"cell_px": 2},
+        {"cell_px": 16, "inverse": "after all"},
         {"cell_px": 1, "origin_px": -56},
-        {"cell_px": 4, "origin_px": -3, "least_first": True},
         {"cell_px": 4, "inverse": "after each", "least_first": True},
     ],
     ids=str,
@@ -89,14 +71,6 @@ def test_gray_code_alone_answers_within_its_cells(code):
     assert np.median(ratio) < 0.8
 
 
-@pytest.mark.parametrize("steps", [5, 7, 8, 10, 11, 13, 17])
-def test_uneven_subsets_are_unbiased(steps):
-    depth = tilted(PAPER)
-    decoded = decode_stack(capture(PAPER, depth, noise=0.5), PAPER, "vertical", steps=steps)
-    error = (decoded.depth_mm - depth * 1000)[decoded.depth_mm > 0]
-    assert abs(np.median(error)) < 0.05 and np.median(np.abs(error)) < 1.0
-
-
 @RIGS
 @pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
 def test_frames_of_floats_decode_as_those_of_bytes(rig, direction):
@@ -116,18 +90,6 @@ def test_frames_of_floats_decode_as_those_of_bytes(rig, direction):
         np.testing.assert_allclose(
             compiled.details[name].coordinate_px, plain.details[name].coordinate_px, atol=1e-10, rtol=0
         )
-
-
-def test_the_compiled_arctangent_is_numpys_on_every_side():
-    from fpp_ml_bench.coding.kernels import _minus_atan2
-
-    angles = np.concatenate([np.linspace(-np.pi, np.pi, 5001), np.arange(-8, 9) * np.pi / 8])
-    for radius in (1e-3, 1.0, 250.0):
-        for y, x in zip(radius * np.sin(angles), radius * np.cos(angles), strict=True):
-            assert _minus_atan2(y, x) == pytest.approx(
-                (lambda p: p if p < np.pi else -np.pi)(-np.arctan2(y, x)), abs=1e-15
-            )
-    assert [_minus_atan2(0.0, -1.0), _minus_atan2(-0.0, -1.0), _minus_atan2(0.0, 0.0)] == [-np.pi, -np.pi, 0.0]
 
 
 def test_mask_threads_and_layout_change_no_bit():
@@ -235,15 +197,6 @@ def test_a_flipped_bit_alone_is_flagged_or_wrong_by_whole_periods(bit):
     assert np.abs(slip - np.rint(slip)).max() < 0.002
 
 
-def test_a_code_that_names_a_cell_beyond_the_pattern_is_masked():
-    phase = np.linspace(-3, 3, 50)
-    for cell in (102, 103, 111, 127):
-        bits = np.repeat((binary_to_gray(cell) >> np.arange(6, -1, -1)[:, None]) & 1, 50, axis=1)
-        levels = np.rint(np.concatenate([sinusoids(phase, 18), 27.5 + 200 * bits])).astype(np.uint8)
-        decoded = plan_direction(coded_rig(), "vertical", 18).decode(levels, Limits())
-        assert (decoded.reason != Reason.DECODED).all()
-
-
 def test_frames_that_are_not_used_may_be_missing():
     frames = capture(PAPER, tilted(PAPER))
     full = decode_stack(frames, PAPER, "horizontal", steps=6)
@@ -262,18 +215,12 @@ def test_frames_that_are_not_used_may_be_missing():
         (lambda f: [x[:, :-1] for x in f], {}, r"expected shape.*\(200, 200\).*got \(200, 199\)"),
         (lambda f: [x.astype(np.float64) for x in f], {}, "expected uint8.*float64"),
         (lambda f: [x.astype(np.float32) + 300 for x in f], {}, "float32 grey levels of 0 to 255"),
-        (lambda f: [x.astype(np.float32) * np.nan for x in f], {}, "float32 grey levels of 0 to 255"),
         (lambda f: [*(x.astype(np.float32) for x in f[:9]), *f[9:]], {}, "dtype of the other frames"),
-        (lambda f: [np.stack([x] * 3, axis=-1) for x in f], {}, r"got \(200, 200, 3\)"),
         (lambda f: f, {"direction": "diagonal"}, "horizontal, vertical or both"),
         (lambda f: f, {"steps": 2}, "3 to the 18"),
-        (lambda f: f, {"steps": 19}, "3 to the 18"),
         (lambda f: f, {"threads": 0}, "threads"),
         (lambda f: f, {"mask": np.ones((200, 200))}, "mask: expected bool"),
-        (lambda f: f, {"mask": np.ones((20, 20), dtype=bool)}, "mask: expected bool"),
         (lambda f: f, {"limits": Limits(min_modulation=float("nan"))}, "min_modulation"),
-        (lambda f: f, {"limits": Limits(max_disagreement_px=-1.0)}, "max_disagreement_px"),
-        (lambda f: f, {"limits": Limits(max_clipped_steps=-1)}, "max_clipped_steps"),
     ],
 )
 def test_what_cannot_be_decoded_is_refused(change, arguments, message):
@@ -288,6 +235,7 @@ def test_noise_alone_is_never_given_a_depth_by_both_directions():
     assert (decoded.depth_mm > 0).mean() < 1e-3
 
 
+@pytest.mark.processes
 def test_without_numba_the_decoder_still_works():
     """In a separate process in which numba can't be imported."""
     code = (
@@ -303,7 +251,7 @@ def test_without_numba_the_decoder_still_works():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize("steps", [4, 5, 6, 9, 18])
+@pytest.mark.parametrize("steps", [4, 18])
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_a_black_frame_is_refused_by_name(steps, direction):
     rig = coded_rig(steps=steps)
@@ -324,7 +272,7 @@ def test_a_dimmed_frame_is_refused_unless_it_is_not_used():
     assert (decode_stack(frames, rig, direction="vertical").depth_mm > 0).mean() > 0.9
 
 
-@pytest.mark.parametrize("steps", [4, 5, 6, 18])
+@pytest.mark.parametrize("steps", [4, 18])
 @pytest.mark.parametrize("pitch", [18.0, 900.0])
 @pytest.mark.parametrize("bend", ["gamma", "clipped", "dark", "flat", "black", "random"])
 def test_no_correct_capture_is_refused(steps, pitch, bend):

@@ -57,13 +57,10 @@ def photographed(rig, light, name="mug", view="A60", **changes):
 @pytest.mark.parametrize(
     "sequence",
     [
-        PAPER,
         PAPER | {"steps": 3},
         PAPER | {"steps": 18},
         TWO,
-        {"order": ["vertical"], "vertical": FOUR},
         {"order": ["vertical", "white", "black"], "vertical": {"scheme": "gray", "cell_px": 4}},
-        {"order": ["vertical"], "vertical": {"scheme": "gray", "cell_px": 4, "inverse": "after each"}},
         {"order": ["vertical"], "vertical": UNIT | {"steps": 3}},
     ],
 )
@@ -72,7 +69,7 @@ def test_what_decodes_right_is_not_refused_nor_warned_of(sequence, light):
     assert said(photographed(rig, light), rig) == []
 
 
-@pytest.mark.parametrize("steps", [3, 4, 6, 9])
+@pytest.mark.parametrize("steps", [3, 4, 9])
 @pytest.mark.parametrize("gamma, noise", [(1.0, 4.0), (1.5, 1.0), (2.2, 1.0)])
 def test_gamma_and_noise_are_no_faults_and_gamma_is_named_where_it_shows(steps, gamma, noise):
     rig = vertical(FOUR | {"steps": steps})
@@ -83,7 +80,7 @@ def test_gamma_and_noise_are_no_faults_and_gamma_is_named_where_it_shows(steps, 
     assert ("response" in [finding.name for finding in found.findings]) == (gamma > 1 and steps <= 4)
 
 
-@pytest.mark.parametrize("steps", [3, 4, 6, 8, 18])
+@pytest.mark.parametrize("steps", [3, 8])
 @pytest.mark.parametrize("copied", [True, False])
 def test_a_frame_delivered_twice_is_named(steps, copied):
     rig = vertical(FOUR | {"steps": steps})
@@ -101,7 +98,7 @@ def test_lamps_that_flicker_by_two_percent_are_no_fault(steps):
     assert said(np.rint(frames * gain[:, None, None]).astype(np.uint8), rig) == []
 
 
-@pytest.mark.parametrize("steps", [3, 4, 6, 8, 18])
+@pytest.mark.parametrize("steps", [3, 4, 18])
 def test_a_late_frame_is_a_wrong_step_and_no_response(steps):
     rig = vertical(FOUR | {"steps": steps})
     frames = frames_of(rig)
@@ -109,14 +106,7 @@ def test_a_late_frame_is_a_wrong_step_and_no_response(steps):
     assert [name for name, _ in said(frames, rig)] == ["wrong step"]
 
 
-def test_the_last_sinusoid_once_more_in_place_of_the_first_gray_frame():
-    rig = vertical(FOUR | {"gray": {"least_first": True}})
-    frames = frames_of(rig)
-    frames[4] = frames_of(rig, seed=1)[3]
-    assert said(frames, rig)[0][0] == "equal frames"
-
-
-@pytest.mark.parametrize("degrees", [-30, 10, 30, 45, 90, 180])
+@pytest.mark.parametrize("degrees", [-30, 10, 180])
 def test_the_common_offset_of_phase_and_gray_code_is_measured(degrees):
     shown = vertical(FOUR | {"origin_px": 57 * degrees / 360})
     assert said(frames_of(shown), shown) == []
@@ -241,9 +231,9 @@ def test_only_what_is_asked_for_is_looked_at():
     assert dark.findings == () and "pixels looked at are lit" in dark.not_checked[-1]
 
 
-@pytest.mark.parametrize("steps", [3, 4, 8])
+@pytest.mark.parametrize("steps", [3, 8])
 @pytest.mark.parametrize("torn", [1, -1, "gray"])
-@pytest.mark.parametrize("first, last", [(140, 199), (185, 199), (0, 70)])
+@pytest.mark.parametrize("first, last", [(185, 199), (0, 70)])
 def test_rows_that_show_another_pattern_are_named(steps, torn, first, last):
     rig = vertical(FOUR | {"steps": steps})
     frames, others = frames_of(rig), frames_of(rig, seed=1)
@@ -254,25 +244,6 @@ def test_rows_that_show_another_pattern_are_named(steps, torn, first, last):
     start, end = text.split("rows ")[1].split(" differ")[0].split(" to ")
     # To a sixteenth of the rows.
     assert abs(int(start) - first) <= 13 and abs(int(end) - last) <= 13
-
-
-def test_columns_of_a_turned_camera_are_named():
-    rig = rig_of(TWO)
-    frames, others = frames_of(rig), frames_of(rig, seed=1)
-    frames[6, :, 150:] = others[5, :, 150:]
-    ((name, text),) = said(frames, rig)
-    assert name == "torn frames" and "columns 150 to" in text
-
-
-@pytest.mark.parametrize("steps", [4, 8])
-def test_a_step_that_becomes_another_one_row_by_row(steps):
-    """A rolling shutter: the frame turns into the one before it between two rows."""
-    rig = vertical(FOUR | {"steps": steps})
-    frames = frames_of(rig).astype(np.float64)
-    share = np.clip((np.arange(SIZE) - 120) / 60, 0, 1)[:, None]
-    frames[2] = (1 - share) * frames[2] + share * frames[1]
-    ((name, text),) = said(np.rint(frames).astype(np.uint8), rig)
-    assert name in ("torn frames", "wrong step") and "step" in text
 
 
 def test_rows_whose_frames_are_all_late_contradict_the_code():

@@ -35,17 +35,6 @@ def test_projection_is_opencvs(count):
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_undistortion_is_opencvs(count):
-    rng = np.random.default_rng(100 + count)
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 1000, 1e-15)
-    for _ in range(50):
-        lens, x, y = _lens(rng, count)
-        seen = np.stack(distort(0.5 * x, 0.5 * y, lens), axis=-1)  # where OpenCV's fixed-point iteration converges
-        expected = cv2.undistortPoints(seen[:, None], np.eye(3), np.array(lens[:count]), criteria=criteria)[:, 0]
-        np.testing.assert_allclose(np.stack(undistort(*seen.T, lens), axis=-1), expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("count", COUNTS)
 def test_undistortion_inverts_up_to_the_fold(count):
     rng = np.random.default_rng(200 + count)
     for _ in range(50):
@@ -98,15 +87,6 @@ def test_rays_that_miss_a_tilted_sensor_have_no_image():
     assert np.isnan(x).tolist() == [True, False, False, False]
 
 
-def test_models_agree_where_their_further_coefficients_are_zero():
-    x, y = np.random.default_rng(1).uniform(-0.5, 0.5, (2, 100))
-    five = (-0.21, 0.11, 0.0013, -0.0021, -0.02)
-    for count in (8, 12, 14):
-        longer = (*five, *[0.0] * (count - 5))
-        for function in (distort, undistort):
-            np.testing.assert_allclose(function(x, y, longer), function(x, y, five), atol=1e-15)
-
-
 def test_torch_tensors_pass_through_the_model():
     torch = pytest.importorskip("torch")
     x, y = np.random.default_rng(2).uniform(-0.4, 0.4, (2, 50))
@@ -117,13 +97,12 @@ def test_torch_tensors_pass_through_the_model():
     assert all(torch.isfinite(t.grad).all() for t in tensors)
 
 
-@pytest.mark.parametrize("suffix", ["yaml", "json"])
 @pytest.mark.parametrize("count", COUNTS[1:])
-def test_rig_files_round_trip(tmp_path, count, suffix):
+def test_rig_files_round_trip(tmp_path, count):
     rig = paper_rig(240)
     rig = replace(rig, projector=replace(rig.projector, distortion=TILTED[:count]))
-    save_rig(rig, tmp_path / f"rig.{suffix}")
-    assert load_rig(tmp_path / f"rig.{suffix}") == rig
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert load_rig(tmp_path / "rig.yaml") == rig
 
 
 def test_four_coefficients_become_five_and_other_numbers_are_refused():

@@ -1,10 +1,9 @@
-"""The projected patterns against the formula, OpenCV's Gray code, and their PNG files."""
+"""The projected patterns against the formula, and their PNG files."""
 
 import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.coding.gray_code import cell_count
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import export_patterns, pattern_image, pattern_profile, pattern_profiles
@@ -31,31 +30,6 @@ def test_sinusoids_are_the_paper_formula_within_rounding(direction, length):
         exact = 127.5 + 127.5 * np.cos(2 * np.pi * w / 18 + 2 * np.pi * n / 18)
         profile = pattern_profile(rig, index)
         assert profile.dtype == np.uint8 and np.abs(profile - exact).max() <= 0.5 + 1e-9
-
-
-def test_steps_are_shifted_copies():
-    # A shift by 2 pi / 18 at pitch 18 is a shift by one pixel.
-    rig = paper_rig()
-    first, second = (pattern_profile(rig, i) for i in rig.sequence.sinusoids("vertical")[:2])
-    assert np.array_equal(first[1:], second[:-1])
-
-
-@pytest.mark.parametrize("direction, length", [("horizontal", 1140), ("vertical", 912)])
-def test_gray_frames_are_opencvs_gray_code_of_the_half_periods(direction, length):
-    rig = paper_rig()
-    cells = cell_count(length, 18)
-    assert cells == {"horizontal": 127, "vertical": 102}[direction]
-    code = cv2.structured_light.GrayCodePattern.create(cells, 1)
-    _, images = code.generate()  # bit, inverse, bit, inverse ... of the columns, most significant first
-    for bit, index in enumerate(rig.sequence.gray(direction)):
-        assert np.array_equal(pattern_profile(rig, index), np.repeat(images[2 * bit][0], 9)[:length])
-
-
-def test_neighbouring_pixels_differ_in_one_bit_at_most():
-    for rig in (paper_rig(), SMALL):
-        for direction in ("horizontal", "vertical"):
-            bits = np.stack([pattern_profile(rig, i) > 0 for i in rig.sequence.gray(direction)])
-            assert (bits[:, 1:] != bits[:, :-1]).sum(axis=0).max() == 1
 
 
 def test_images_vary_along_the_right_axis_and_agree_with_the_profiles():

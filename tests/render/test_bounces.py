@@ -1,7 +1,6 @@
-"""Further bounces against theory: integrating sphere, form factors of rectangles, a groove, light from the plane.
+"""Further bounces against theory: integrating sphere, a groove, light from the plane.
 
-Rays are a fixed sequence, so every deviation below is a constant of this code. Form factors by Howell's catalogue
-(C-11, C-14) and by Lambert's contour formula.
+Rays are a fixed sequence, so every deviation below is a constant of this code. Form factors by Lambert's formula.
 """
 
 from functools import cache
@@ -13,7 +12,7 @@ from rendering import CENTRE, PAPER, RIG, sheet, solid
 
 from fpp_ml_bench.loaders.render.bounces import PlaneLight, at_points, between_surfels
 from fpp_ml_bench.loaders.render.projector import PatternLight
-from fpp_ml_bench.loaders.render.scene import SolidMesh
+from fpp_ml_bench.loaders.render.scene import SolidMesh, turned
 from fpp_ml_bench.loaders.render.surfels import RAYS, Surfels
 
 WHITE = RIG.sequence.white
@@ -51,80 +50,10 @@ def test_integrating_sphere_in_uniform_light(rho):
     np.testing.assert_array_equal(total[~cavity], 0)
 
 
-@pytest.mark.parametrize("rho", [0.5, 0.8])
-def test_integrating_sphere_with_a_lit_cap(rho):
-    """Every part of a sphere sees every other alike: a lit share phi of it gives rho phi / (1 - rho) everywhere."""
-    surfels, cavity = hollow_sphere()
-    cap = cavity & (surfels.grid.position_m[:, 2] > 0.015)
-    area = surfels.grid.area_m2
-    phi = area[cap].sum() / area[cavity].sum()
-    assert phi == pytest.approx((1 - 0.015 / 0.04) / 2, abs=0.02)
-    total = bounced(surfels, cap.astype(float), rho)[cavity]
-    expected = rho * phi / (1 - rho)
-    assert np.average(total, weights=area[cavity]) == pytest.approx(expected, rel=5e-3)
-    assert np.sqrt(np.mean((total / expected - 1) ** 2)) < 0.05
-    # As it reaches the surface, between surfels.
-    points = surfels.points.position_m[::40]
-    inside = np.linalg.norm(points, axis=1) < 0.045
-    normals = surfels.points.normal[::40]
-    full = np.zeros((len(area), 1))
-    full[cavity, 0] = total
-    smooth = at_points(surfels.grid, full, points[inside], normals[inside])[0]
-    assert np.sqrt(np.mean((smooth / expected - 1) ** 2)) < 0.03
-
-
-def from_to(surfels, source, target):
-    """Share of the light of the surfels ``source`` that arrives at ``target``, both bool (K,)."""
-    area = surfels.grid.area_m2
-    return np.average(matrix(surfels)[np.ix_(source, target)].sum(axis=1), weights=area[source])
-
-
-def parallel_squares(distance):
-    """C-11: equal parallel squares, side / distance = x."""
-    x = 1 / distance
-    s = np.sqrt(1 + x * x)
-    inner = np.log(np.sqrt((1 + x * x) ** 2 / (1 + 2 * x * x))) + 2 * x * s * np.arctan(x / s) - 2 * x * np.arctan(x)
-    return 2 / (np.pi * x * x) * inner
-
-
-def perpendicular(h, w):
-    """C-14: rectangles with a common edge; h: height of the target, w: depth of the source, by the edge's length."""
-    a, b, root = h * h, w * w, np.sqrt(h * h + w * w)
-    logs = (1 + b) * (1 + a) / (1 + b + a)
-    logs *= (b * (1 + b + a) / ((1 + b) * (b + a))) ** b * (a * (1 + a + b) / ((1 + a) * (a + b))) ** a
-    return (w * np.arctan(1 / w) + h * np.arctan(1 / h) - root * np.arctan(1 / root) + np.log(logs) / 4) / (np.pi * w)
-
-
-@pytest.mark.parametrize("distance", [0.5, 1.0, 2.0])
-def test_two_parallel_squares(distance):
-    sides = [0.1, 0, 0], [0, 0.1, 0]
-    surfels = Surfels.of(sheet(([0, 0, 0], *sides), ([0, 0, 0.1 * distance], *sides)))
-    z, n = surfels.grid.position_m[:, 2], surfels.grid.normal[:, 2]
-    low, high = (z < 0.05 * distance) & (n > 0), (z > 0.05 * distance) & (n < 0)
-    expected = parallel_squares(distance)
-    assert parallel_squares(1.0) == pytest.approx(0.19982, abs=1e-5)
-    assert from_to(surfels, low, high) == pytest.approx(expected, rel=0.02)
-    assert from_to(surfels, high, low) == pytest.approx(expected, rel=0.02)
-    # The outer sides see nothing of each other.
-    assert matrix(surfels)[~(low | high)].sum() == 0
-    assert surfels.open_share[~(low | high)].min() == 1
-
-
-def right_angle(depth, height):
-    """A floor and a wall with a common edge of 10 cm, their other sides given by it."""
+def right_angle():
+    """A floor and a wall of 10 cm with a common edge."""
     edge = [0.1, 0, 0]
-    return sheet(([0, 0, 0], edge, [0, 0.1 * depth, 0]), ([0, 0, 0], edge, [0, 0, 0.1 * height]))
-
-
-@pytest.mark.parametrize(("height", "depth"), [(1.0, 1.0), (0.5, 1.0), (1.0, 0.4)])
-def test_two_perpendicular_rectangles(height, depth):
-    surfels = Surfels.of(
-        sheet(([0, 0, 0], [0.1, 0, 0], [0, 0.1 * depth, 0]), ([0, 0, 0], [0.1, 0, 0], [0, 0, 0.1 * height]))
-    )
-    floor, wall = surfels.grid.normal[:, 2] > 0.5, surfels.grid.normal[:, 1] > 0.5
-    assert perpendicular(1.0, 1.0) == pytest.approx(0.20004, abs=1e-5)
-    assert from_to(surfels, floor, wall) == pytest.approx(perpendicular(height, depth), rel=0.03)
-    assert from_to(surfels, wall, floor) == pytest.approx(perpendicular(height, depth) * depth / height, rel=0.03)
+    return sheet(([0, 0, 0], edge, [0, 0.1, 0]), ([0, 0, 0], edge, [0, 0, 0.1]))
 
 
 def contour(points, normals, corners):
@@ -157,11 +86,11 @@ def groove(side=0.1, n=12):
 def test_groove_of_two_squares():
     """All bounces between two sides at a right angle in uniform light, place by place."""
     rho, (centres, factors) = 0.8, groove()
-    assert factors.sum(axis=1).mean() == pytest.approx(perpendicular(1.0, 1.0), rel=0.01)
+    assert factors.sum(axis=1).mean() == pytest.approx(0.20004, rel=0.01)  # Howell's C-14
     # Both sides are alike: E = F rho (1 + E).
     n = len(centres)
     expected = np.linalg.solve(np.eye(n) - rho * factors, rho * factors.sum(axis=1))
-    surfels = Surfels.of(right_angle(1.0, 1.0))
+    surfels = Surfels.of(right_angle())
     normal = surfels.grid.normal
     inner = (normal[:, 2] > 0.5) | (normal[:, 1] > 0.5)
     values = bounced(surfels, inner.astype(float), rho)[:, None]
@@ -208,16 +137,8 @@ def test_rows_and_reciprocity(name):
     assert max(crossing) == 0 if name == "box" else max(crossing) > 20
 
 
-@pytest.mark.parametrize(
-    "mesh",
-    [
-        SHAPES["box"],
-        solid(trimesh.creation.icosphere(4, 0.08)),
-        solid(trimesh.creation.cylinder(0.05, 0.2, sections=64)),
-    ],
-)
-def test_a_convex_object_gets_nothing_from_itself(mesh):
-    surfels = Surfels.of(mesh)
+def test_a_convex_object_gets_nothing_from_itself():
+    surfels = Surfels.of(solid(trimesh.creation.icosphere(4, 0.08)))
     assert surfels.open_share.min() == 1 and surfels.form_factors.nnz == 0
     outside = np.random.default_rng(0).random((len(surfels.grid.area_m2), 2))
     np.testing.assert_array_equal(between_surfels(surfels, outside, outside, np.full(len(outside), 0.9)), outside)
@@ -249,20 +170,14 @@ def test_both_sides_of_a_sheet_that_encloses_nothing():
         assert surfels.open_share[~inside].min() == 1
 
 
-def test_interpolation_reproduces_a_constant_and_is_smooth():
+def test_interpolation_reproduces_a_constant_and_a_ramp():
     mesh = trimesh.creation.icosphere(4, 0.08)
-    surfels = Surfels.of(solid(mesh))
-    grid = surfels.grid
-    rng = np.random.default_rng(0)
+    grid = Surfels.of(solid(mesh)).grid
     points, triangle = trimesh.sample.sample_surface(mesh, 3000, seed=1)
     values = np.column_stack([np.full(len(grid.area_m2), 0.37), grid.position_m[:, 0]])
     constant, x = at_points(grid, values, np.asarray(points), mesh.face_normals[triangle])
     np.testing.assert_allclose(constant, 0.37, rtol=1e-6)
     assert np.abs(x - points[:, 0]).max() < 0.5 * grid.cell_m
-    # A step of a hundredth of a cell changes nothing by more than a few hundredths of a cell.
-    step = points + rng.normal(size=points.shape) * 0.01 * grid.cell_m
-    moved = at_points(grid, values, step, mesh.face_normals[triangle])[1]
-    assert np.abs(moved - x).max() < 0.1 * grid.cell_m
     far = at_points(grid, values, np.array([[0.5, 0.5, 0.5], [np.nan] * 3]), np.array([[0.0, 0, 1], [0, 0, 1]]))
     assert (far == 0).all()
 
@@ -276,9 +191,7 @@ def test_light_from_the_background_plane_against_an_integral():
     offset = np.array([0.05, -0.02, 1.9])
     degrees = 120
     found = plane.upon(surfels, degrees, offset)[:, WHITE]
-    a = np.radians(degrees)
-    rotation = np.array([[-np.sin(a), -np.cos(a), 0], [0, 0, -1], [np.cos(a), -np.sin(a), 0]])
-    position, normal = surfels.grid.position_m @ rotation.T + offset, surfels.grid.normal @ rotation.T
+    position, normal = turned(surfels.grid.position_m, degrees) + offset, turned(surfels.grid.normal, degrees)
     # The pattern's outer pixel edges, sent from the projector to 3.2 m.
     x = CENTRE[0] + 3.2 * (np.array([-0.5, 911.5]) - 455.5) / 1824
     y = CENTRE[1] + 3.2 * (np.array([-0.5, 1139.5]) - 569.5) / 1824

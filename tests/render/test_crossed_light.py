@@ -1,17 +1,16 @@
-"""The light of crossed fringes: beside the mean of two directions, against a convolution of the image, in a dataset."""
+"""The light of crossed fringes: against a convolution of the image, and in a dataset."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from rendering import DIRECT, PAPER, RIG, kept, studio
+from rendering import PAPER, RIG
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.builder import build
-from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.projector import PatternLight, defocus_variance_px2, response_table
 from fpp_ml_bench.loaders.render.scene import BuildSettings, preset_settings
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -22,20 +21,7 @@ from fpp_ml_bench.optics.sequence import CodedSequence, Sequence
 SHORT = replace(RIG, sequence=Sequence(steps=3))
 
 
-BOTH = SHORT.with_crossed(Crossed((18.0, 18.0)))
-
-
-@pytest.mark.parametrize("light", [PAPER, DIRECT.changed("projector", pixel_blur_px=1.0, defocus_px=2.0, focus_m=1.6)])
-def test_a_crossed_frame_of_equal_periods_is_the_mean_of_both_directions(light):
-    frames = kept(studio(light, rig=BOTH).photograph(solid_mesh("mug"), "A60"))
-    rows, columns = BOTH.sequence.sinusoids("horizontal")[0], BOTH.sequence.sinusoids("vertical")[0]
-    difference = frames[0] - (frames[rows].astype(float) + frames[columns]) / 2
-    difference = difference[:, :-3]  # beyond, at the pattern's end, blur repeats its last pixel
-    assert frames[0].std() > 15 and np.abs(difference).max() <= 1.5
-    assert abs(difference.mean()) < 0.1
-
-
-@pytest.mark.parametrize("response", [1.0, 2.2, (0.0, 0.3, 0.5, 1.0)])
+@pytest.mark.parametrize("response", [1.0, (0.0, 0.3, 0.5, 1.0)])
 @pytest.mark.parametrize("defocus_px", [0.0, 2.5])
 def test_light_is_the_image_through_response_and_blur(response, defocus_px):
     family = Crossed((18.0, 13.0), (15.0, 80.0), (0.6, 0.4), ((90.0, 30.0),))
@@ -69,13 +55,9 @@ def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path)
     for view in VIEWS[:2]:
         depth_mm, other_mm = (dataset.depth_mm(f"cork_{view}") for dataset in (opened, paper))
         both = (depth_mm > 0) & (other_mm > 0)
-        assert both.sum() > 100 and np.array_equal(
-            opened.depth_mm(f"cork_{view}", "depth_exact"), paper.depth_mm(f"cork_{view}", "depth_exact")
-        )
-        assert np.abs(depth_mm - other_mm)[both].mean() < 0.5
+        assert both.sum() > 100 and np.abs(depth_mm - other_mm)[both].mean() < 0.5
         frames = np.stack([opened.frame(f"cork_{view}", n) for n in range(3)]).astype(float)
-        wave = np.tensordot(np.exp(2j * np.pi * np.arange(3) / 3), frames, 1) * 2 / 3
-        assert np.median(np.abs(wave)[both]) > 20
+        assert np.median(np.ptp(frames, axis=0)[both]) > 40
 
 
 def test_what_can_not_be_built_is_said():

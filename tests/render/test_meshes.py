@@ -67,14 +67,10 @@ def test_obj_with_a_latin1_comment_and_a_missing_material_file(tmp_path, wedge):
     assert corner_distance(mesh.vertices_m, wedge.vertices) < 1e-6
 
 
-def test_ply_of_a_mesh_reads_back_and_is_the_same_bytes_twice(tmp_path):
-    mesh = solid_mesh("cork")
-    for name in ("a.ply", "b.ply"):
-        write_ply(mesh, tmp_path / "meshes" / name)
-    files = sorted((tmp_path / "meshes").iterdir())
-    assert [f.name for f in files] == ["a.ply", "b.ply"]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    back = trimesh.load(files[0], process=False)
+def test_ply_of_a_mesh_reads_back(tmp_path):
+    mesh, path = solid_mesh("cork"), tmp_path / "meshes" / "a.ply"
+    write_ply(mesh, path)
+    back = trimesh.load(path, process=False)
     np.testing.assert_allclose(back.vertices, mesh.vertices_m, atol=1e-7)
     np.testing.assert_array_equal(back.faces, mesh.faces)
 
@@ -84,8 +80,8 @@ def test_ply_of_a_mesh_reads_back_and_is_the_same_bytes_twice(tmp_path):
     [
         (suffix, damage)
         for suffix in SUFFIXES
-        for damage in ("empty", "noise", "text", "third", "almost whole")
-        if not (suffix == "obj" and damage in ("third", "almost whole"))  # a shorter OBJ is an OBJ
+        for damage in ("empty", "noise", "almost whole")
+        if not (suffix == "obj" and damage == "almost whole")  # a shorter OBJ is an OBJ
     ],
 )
 def test_damaged_files_are_refused_by_name(tmp_path, wedge, capfd, suffix, damage):
@@ -95,8 +91,6 @@ def test_damaged_files_are_refused_by_name(tmp_path, wedge, capfd, suffix, damag
     content = {
         "empty": b"",
         "noise": np.random.default_rng(3).bytes(900),
-        "text": b"<html><body>404 not found</body></html>",
-        "third": whole[: len(whole) // 3],
         "almost whole": whole[:-7],
     }[damage]
     path.write_bytes(content)
@@ -168,29 +162,16 @@ def test_single_mesh_is_named_after_its_file(part):
     ("content", "says"),
     [
         ("", "expected a list"),
-        ("name: x", "expected a list"),
-        ("[]", "expected a list"),
         ("[1, 2]", "entry 1:\n  the file as a whole: Input should be a valid dictionary"),
-        ("- [unclosed", "is no plain YAML"),
         ([{"name": "x"}], "path: is missing"),
         ([{"name": "x", "path": "PART", "sclae": 2}], "sclae: is not a key"),
-        ([{"name": "x", "path": "PART", "content": "0"}], "content: is not a key"),
         ([{"name": "X y", "path": "PART"}], "name: String should match"),
-        ([{"name": "", "path": "PART"}], "name: String should match"),
-        ([{"name": 5, "path": "PART"}], "name: Input should be a valid string"),
         ([{"name": "mug", "path": "PART"}], "one of the benchmark's own"),
         ([{"name": "gear", "path": "PART"}], "one of the benchmark's own"),
         ([{"name": "x", "path": "nothing.stl"}], "no mesh file"),
-        ([{"name": "x", "path": "list.yaml"}], "no mesh file"),
-        ([{"name": "x", "path": None}], "path: Input should be a valid string"),
         ([{"name": "x", "path": "PART", "split": "val"}], r"split: Input should be .* \(got 'val'\)"),
-        ([{"name": "x", "path": "PART", "split": ["test"]}], "split: Input should be"),
         ([{"name": "x", "path": "PART", "scale": 0}], "scale: Input should be greater than 0"),
-        ([{"name": "x", "path": "PART", "scale": -1}], "scale: Input should be greater than 0"),
-        ([{"name": "x", "path": "PART", "scale": "big"}], "scale: Input should be a valid number"),
-        ([{"name": "x", "path": "PART", "scale": float("nan")}], r"\[0\].scale: NaN is no number"),
         ([{"name": "x", "path": "PART", "scale": True}], "scale: Input should be a valid number"),
-        ([{"name": "x", "path": "PART", "rotation_deg": 90}], "rotation_deg: Input should be a valid tuple"),
         ([{"name": "x", "path": "PART", "rotation_deg": [0, 0]}], "rotation_deg.2: is missing"),
         ([{"name": "x", "path": "PART", "offset_m": [0, 0, None]}], "offset_m.2: Input should be a valid number"),
         ([{"name": "x", "path": "PART", "centre": "yes"}], "centre: Input should be a valid boolean"),
@@ -209,20 +190,16 @@ def test_bad_lists_are_refused(part, content, says):
     assert str(path) in str(caught.value)
 
 
-def test_unreadable_lists(tmp_path):
+def test_a_list_that_is_not_there(tmp_path):
     with pytest.raises(MeshError, match="can't be read"):
         read_mesh_list(tmp_path / "none.yaml")
-    (tmp_path / "latin.yaml").write_bytes(b"- {name: m\xfcller}")
-    with pytest.raises(MeshError, match=r"latin\.yaml: expected UTF-8"):
-        read_mesh_list(tmp_path / "latin.yaml")
 
 
 def test_own_names_can_never_meet_the_benchmarks(part):
-    for name in OBJECTS[:3]:
-        path = part.with_name(f"{name}.stl")
-        path.write_bytes(part.read_bytes())
-        with pytest.raises(MeshError, match="own objects"):
-            single_mesh(path)
+    path = part.with_name(f"{OBJECTS[0]}.stl")
+    part.rename(path)
+    with pytest.raises(MeshError, match="own objects"):
+        single_mesh(path)
 
 
 def test_a_mesh_is_read_from_the_present_folder_by_a_process_that_started_in_another(tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from fpp_ml_bench.loaders.render.boards.poses import (
     fitting_board,
     sheet_corners_mm,
 )
-from fpp_ml_bench.loaders.render.boards.sheet import DARK, board_view, dark_share
+from fpp_ml_bench.loaders.render.boards.sheet import DARK, board_view
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig_file import load_rig
@@ -87,21 +87,6 @@ def test_the_corners_of_a_checker_are_where_opencv_projects_them():
     assert np.sqrt(np.mean(error**2)) < 0.06 and np.abs(error.mean(axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize("footprint_mm", [0.4, 1.7])
-def test_the_dark_area_is_that_of_the_print(footprint_mm):
-    place = np.arange(-120.0, 420.0, footprint_mm)
-    x, y = np.meshgrid(place, place)
-    footprint = (np.full_like(x, footprint_mm), 0 * x, 0 * x, np.full_like(x, footprint_mm))
-    for board, area_mm2 in (
-        (Board("circles", 3, 4, 50.0, 15.0), 12 * np.pi * 15**2),
-        (Board("circles-asymmetric", 3, 4, 50.0, 15.0), 12 * np.pi * 15**2),
-        (Board("checker", 4, 5, 40.0), 15 * 40**2),
-    ):
-        share = dark_share(board, x, y, footprint)
-        assert share.min() == 0 and share.max() == 1
-        assert share.sum() * footprint_mm**2 == pytest.approx(area_mm2, rel=2e-3)
-
-
 def test_the_boards_of_the_papers_rig():
     assert len(board_poses(paper_rig(), PAPER_BOARD)) == 18
     assert (BOARD.kind, BOARD.columns, BOARD.rows, BOARD.spacing_mm, BOARD.radius_mm) == ("circles", 5, 9, 50.0, 15.0)
@@ -118,7 +103,6 @@ def test_poses_fit_and_are_spread(rig):
         rotation = np.array(pose.rotation)
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
         placed = corners_m @ rotation.T + pose.translation_m
-        np.testing.assert_allclose(pose.points_m(corners_m), placed, atol=1e-12)
         assert placed[:, 2].min() >= 1.5 - 1e-9 and placed[:, 2].max() <= 2.1 + 1e-9
         for device, (u, v) in ((rig.camera, rig.camera.project(placed)), (rig.projector, rig.project(placed))):
             assert u.min() > 0 and v.min() > 0 and u.max() < device.width - 1 and v.max() < device.height - 1
@@ -172,7 +156,6 @@ def test_folders_that_are_refused(tmp_path):
         {"light": named_light("workshop")},
         {"poses": board_poses(RIG, BOARD, 2)},
         {"board": Board("circles", 5, 9, 40.0, 12.0)},
-        {"rig": replace(RIG, background_m=3.0)},
     )
     for change in others:
         asked = {"rig": RIG, "board": BOARD, "poses": poses, **change}

@@ -68,9 +68,11 @@ SHAPES = {
 def test_depth_is_that_of_the_facets(name):
     mesh = SHAPES[name]
     vertices_m = np.add(mesh.vertices, [0, 0, 1.8])
-    depth_m, expected = depth_image(traced_mesh(mesh).primary(RAYS)), brute_force(vertices_m, mesh.faces)
+    hits, expected = traced_mesh(mesh).primary(RAYS), brute_force(vertices_m, mesh.faces)
+    depth_m = depth_image(hits)
     np.testing.assert_array_equal(depth_m > 0, expected > 0)
-    assert (expected > 0).sum() > 500
+    assert (expected > 0).sum() > 500 and (np.diff(hits.pixels) > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(hits.normals, axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(depth_m, expected, atol=1e-12)
 
 
@@ -85,15 +87,6 @@ def test_rays_of_a_camera_with_lens_distortion():
             expected = brute_force(vertices_m, mesh.faces, rays)
             np.testing.assert_array_equal(depth_m > 0, expected > 0)
             np.testing.assert_allclose(depth_m, expected, atol=1e-12)
-
-
-def test_rays_in_any_order():
-    """The bounds of rows and columns only save work: rays in no order at all give the same answer."""
-    order = np.random.default_rng(3).permutation(X.size)
-    mesh = SHAPES["box turned"]
-    plain = depth_image(traced_mesh(mesh).primary(RAYS)).ravel()[order]
-    hits = traced_mesh(mesh).primary(PixelRays(X.ravel()[order].reshape(X.shape), Y.ravel()[order].reshape(X.shape)))
-    np.testing.assert_array_equal(depth_image(hits).ravel(), plain)
 
 
 def test_slivers_and_large_triangles():
@@ -123,60 +116,13 @@ def test_no_ray_passes_between_neighbours():
     assert seen[inside].all()
 
 
-@pytest.mark.parametrize("name", SHAPES)
-def test_normals_are_unit_and_face_the_camera(name):
-    hits = traced_mesh(SHAPES[name]).primary(RAYS)
-    directions = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)])[hits.pixels]
-    np.testing.assert_allclose(np.linalg.norm(hits.normals, axis=1), 1, atol=1e-12)
-    assert (np.einsum("ij,ij->i", hits.normals, directions) <= 0).all()
-    assert (np.diff(hits.pixels) > 0).all()
-
-
-def test_fine_sphere_to_its_chord_error():
-    radius, centre = 0.15, np.array([0.02, -0.03, 1.8])
-    sphere = trimesh.creation.icosphere(5, radius)
-    hits = traced(sphere.vertices + centre, sphere.faces).primary(RAYS)
-    directions = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)])
-    a = np.einsum("ij,ij->i", directions, directions)
-    b = directions @ centre
-    root = b**2 - a * (centre @ centre - radius**2)
-    exact = (b - np.sqrt(np.where(root > 0, root, np.nan))) / a
-    longest = np.linalg.norm(sphere.vertices[sphere.edges[:, 0]] - sphere.vertices[sphere.edges[:, 1]], axis=1).max()
-    # The farthest point of a facet from its sphere lies R - sqrt(R^2 - rho^2) inside, rho <= edge / sqrt(3).
-    chord_m = radius - np.sqrt(radius**2 - longest**2 / 3)
-    normal = (directions[hits.pixels] * hits.depth_m[:, None] - centre) / radius
-    slope = np.abs(np.einsum("ij,ij->i", normal, directions[hits.pixels])) / np.sqrt(a[hits.pixels])
-    steep = slope < 0.1
-    error = hits.depth_m - exact[hits.pixels]
-    assert (error[~steep] > -1e-9).all()  # facets lie inside the sphere
-    assert (error[~steep] < 1.05 * chord_m / slope[~steep]).all()
-    assert chord_m < 1e-4 and (~steep).mean() > 0.95
-    outline = np.nansum(root > 0)
-    assert abs(hits.pixels.size - outline) < 0.02 * outline
-
-
-def test_facing_and_tilted_planes():
-    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
-    faces = [[0, 1, 2], [0, 2, 3]]
-    hits = traced(np.add(square, [0, 0, 2.0]), faces).primary(RAYS)
-    assert hits.pixels.size == X.size
-    np.testing.assert_allclose(hits.depth_m, 2.0, atol=1e-12)
-    np.testing.assert_allclose(hits.normals, [[0, 0, -1]] * X.size, atol=1e-12)
+def test_a_tilted_plane():
+    square = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]], dtype=float)
+    square[:, 2] += square[:, :2] @ [0.3, -0.2]
     normal = np.array([0.3, -0.2, -1.0])
-    tilted = np.add(square, [0, 0, 2.0])
-    tilted[:, 2] = 2.0 + 0.3 * tilted[:, 0] - 0.2 * tilted[:, 1]
-    hits = traced(tilted, faces).primary(RAYS)
-    expected = 2.0 / (1 - 0.3 * X + 0.2 * Y)  # z = 2 + 0.3 x z - 0.2 y z
-    np.testing.assert_allclose(depth_image(hits), expected, atol=1e-9)
+    hits = traced(square, [[0, 1, 2], [0, 2, 3]]).primary(RAYS)
+    np.testing.assert_allclose(depth_image(hits), 2.0 / (1 - 0.3 * X + 0.2 * Y), atol=1e-9)  # z = 2 + 0.3 x z - 0.2 y z
     np.testing.assert_allclose(hits.normals, [normal / np.linalg.norm(normal)] * X.size, atol=1e-9)
-
-
-def test_box_front_face():
-    hits = traced_mesh(trimesh.creation.box((0.2, 0.2, 0.2))).primary(RAYS)
-    image = depth_image(hits)
-    front = (np.abs(X) < 0.099 / 1.7) & (np.abs(Y) < 0.099 / 1.7)
-    np.testing.assert_allclose(image[front], 1.7, atol=1e-9)
-    assert (image[(np.abs(X) > 0.101 / 1.7) | (np.abs(Y) > 0.101 / 1.7)] == 0).all()
 
 
 def test_flipped_winding_changes_nothing():
@@ -214,29 +160,9 @@ def test_edge_on_and_degenerate_triangles():
         traced(vertices, [[n, n + 1, n + 2]])
 
 
-def test_non_manifold_mesh():
-    """Three sheets that share one edge, one of them given twice: the nearest surface wins, without a hole."""
-    top, bottom = [0, -0.1, 1.8], [0, 0.1, 1.8]
-    wings = [[-0.1, 0, 1.9], [0.1, 0, 1.9], [0.02, 0, 2.0]]
-    faces = [[0, 1, 2], [0, 1, 3], [0, 1, 4], [1, 0, 2]]
-    vertices = np.array([top, bottom, *wings])
-    depth_m, expected = depth_image(traced(vertices, faces).primary(RAYS)), brute_force(vertices, faces)
-    np.testing.assert_array_equal(depth_m > 0, expected > 0)
-    assert (expected > 0).sum() > 100
-    np.testing.assert_allclose(depth_m, expected, atol=1e-12)
-
-
 def test_a_wall_behind_the_camera_is_not_seen():
     wall = [[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]
     assert not traced(wall, [[0, 1, 2], [0, 2, 3]]).primary(RAYS).pixels.size
-
-
-def test_camera_inside_the_object():
-    shell = trimesh.creation.icosphere(4, 2.0)
-    hits = traced(shell.vertices, shell.faces).primary(RAYS)
-    assert hits.pixels.size == X.size
-    length = hits.depth_m * np.sqrt(X.ravel() ** 2 + Y.ravel() ** 2 + 1)
-    np.testing.assert_allclose(length, 2.0, rtol=2e-3)
 
 
 def test_rays_without_a_direction_see_nothing():
@@ -246,45 +172,6 @@ def test_rays_without_a_direction_see_nothing():
     assert hits.pixels.size and hits.pixels.min() >= 88 * 176
 
 
-def test_object_beside_the_image_is_not_hit():
-    mesh = trimesh.creation.icosphere(2, 0.1)
-    hits = traced(np.add(mesh.vertices, [3.0, 0, 1.8]), mesh.faces).primary(RAYS)
-    assert hits.pixels.size == 0
-
-
-def test_shadow_of_a_known_occluder():
-    """A square between light and plane: a point is in shadow where the line to the light crosses the square."""
-    square = np.array([[-0.1, -0.1, 1.5], [0.1, -0.1, 1.5], [0.1, 0.1, 1.5], [-0.1, 0.1, 1.5]])
-    occluder = traced(square, [[0, 1, 2], [0, 2, 3]])
-    light = np.array([-0.125, 0.1, 0.0])
-    points = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)]) * 2.0
-    crossing = light + (points - light) * (1.5 / 2.0)
-    inside = np.abs(crossing[:, :2]).max(axis=1)
-    dark = occluder.shadowed(points, light)
-    np.testing.assert_array_equal(dark, inside < 0.1)
-    assert 1000 < dark.sum() < 5000
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_what_lies_between_two_points(name):
-    """Segments in any direction against every triangle in turn; the box tree may change nothing."""
-    mesh, rng = SHAPES[name], np.random.default_rng(6)
-    vertices_m = np.add(mesh.vertices, [0.0, 0.0, 1.8])
-    starts, ends = rng.normal([0, 0, 1.8], 0.12, (2, 4000, 3))
-    ends[:500, 0] = starts[:500, 0]  # in the plane of the boxes' sides
-    ends[500:800, :2] = starts[500:800, :2]
-    direction, blocked = ends - starts, np.zeros(len(starts), dtype=bool)
-    for a, b, c in vertices_m[mesh.faces]:
-        normal = np.cross(b - a, c - a)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = (a - starts) @ normal / (direction @ normal)
-            point = starts + along[:, None] * direction
-            inside = [np.cross(q - p, point - p) @ normal >= 0 for p, q in ((a, b), (b, c), (c, a))]
-        blocked |= (along > 0) & (along < 1) & inside[0] & inside[1] & inside[2]
-    assert 0.2 < blocked.mean() < 0.95
-    np.testing.assert_array_equal(traced(vertices_m, mesh.faces).met(starts, ends, any_suffices=True)[1] >= 0, blocked)
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_where_a_line_first_meets_the_object(name):
     """`met` against Moeller-Trumbore over every line and triangle."""
@@ -292,6 +179,7 @@ def test_where_a_line_first_meets_the_object(name):
     vertices_m = np.add(mesh.vertices, [0.0, 0.0, 1.8])
     starts, ends = rng.normal([0, 0, 1.8], 0.12, (2, 3000, 3))
     ends[:300, 0] = starts[:300, 0]  # in the plane of the boxes' sides
+    ends[300:500, :2] = starts[300:500, :2]
     way, nearest = ends - starts, np.ones(len(starts))
     for a, b, c in vertices_m[mesh.faces]:
         p = np.cross(way, c - a)

@@ -48,17 +48,6 @@ def frames():
 
 
 @pytest.mark.parametrize("name", STREAMS)
-def test_moments_are_those_of_a_standard_normal(frames, name):
-    z = frames[name]
-    n = z.size
-    # Bounds: five standard errors of the moments of n normal deviates.
-    assert abs(z.mean()) < 5 / np.sqrt(n)
-    assert abs(z.var() - 1) < 5 * np.sqrt(2 / n)
-    assert abs(stats.skew(z)) < 5 * np.sqrt(6 / n)
-    assert abs(stats.kurtosis(z)) < 5 * np.sqrt(24 / n)
-
-
-@pytest.mark.parametrize("name", STREAMS)
 def test_distribution_is_normal(frames, name):
     z = frames[name]
     assert stats.kstest(z, "norm").pvalue > 1e-3
@@ -70,17 +59,10 @@ def test_distribution_is_normal(frames, name):
     assert a2 < 6.0
 
 
-def test_a_wrong_distribution_would_be_noticed():
-    uniform_sum = np.random.default_rng(1).random((4, 200_000)).sum(axis=0)
-    poor = (uniform_sum - 2) * np.sqrt(3)  # the sum of four uniforms, scaled: a popular cheap normal
-    assert stats.kstest(poor, "norm").pvalue < 1e-6
-
-
-@pytest.mark.parametrize("limit", [3.0, 3.5, 4.0, 4.5])
-def test_tails_hold_as_many_pixels_as_they_should(frames, limit):
+def test_tails_hold_as_many_pixels_as_they_should():
     z = np.concatenate([deviates(42, "bowl", "A60", frame) for frame in range(12)])
-    for count, share in (((z > limit).sum(), stats.norm.sf(limit)), ((z < -limit).sum(), stats.norm.sf(limit))):
-        expected = z.size * share
+    expected = z.size * stats.norm.sf(4.0)
+    for count in ((z > 4.0).sum(), (z < -4.0).sum()):
         assert abs(count - expected) < 5 * np.sqrt(expected) + 0.02 * expected
 
 
@@ -94,7 +76,7 @@ def test_largest_deviate_is_as_documented():
         normal_table()[0] = 0
 
 
-@pytest.mark.parametrize("lag", [1, 2, 3, 7, 16, 64, 255, 256, SIZE - 1, SIZE, SIZE + 1, 4096, 65536])
+@pytest.mark.parametrize("lag", [1, 16, 255, SIZE, 65536])
 def test_pixels_are_independent_of_their_neighbours(frames, lag):
     for z in frames.values():
         bound = 5 / np.sqrt(z.size - lag)
@@ -104,41 +86,14 @@ def test_pixels_are_independent_of_their_neighbours(frames, lag):
         assert abs(correlation(z[:-lag] ** 2, z[lag:] ** 2)) < bound
 
 
-def test_spectrum_of_a_frame_is_white(frames):
-    for z in frames.values():
-        power = np.abs(np.fft.rfft2(z.reshape(SIZE, SIZE))) ** 2 / z.size
-        inner = power[1:480, 1:480].ravel()  # independent exponential values of mean 1
-        assert stats.kstest(inner, "expon").pvalue > 1e-3
-        assert inner.max() < np.log(inner.size) + 12
-
-
 @pytest.mark.parametrize(
-    ("name", "other_name"),
-    [
-        ((42, "mug", "A0", 0), (42, "mug", "A0", 1)),
-        ((42, "mug", "A0", 0), (42, "mug", "A60", 0)),
-        ((42, "mug", "A0", 0), (42, "bowl", "A0", 0)),
-        ((42, "mug", "A0", 0), (43, "mug", "A0", 0)),
-        ((42, "mug", "A0", 1), (42, "mug", "A0", 11)),
-    ],
+    "other", [(42, "mug", "A0", 1), (42, "mug", "A60", 0), (42, "bowl", "A0", 0), (43, "mug", "A0", 0)]
 )
-def test_frames_views_objects_and_seeds_are_independent(name, other_name):
-    a, b = deviates(*name), deviates(*other_name)
+def test_frames_views_objects_and_seeds_are_independent(frames, other):
+    a, b = frames[STREAMS[0]], deviates(*other)
     bound = 5 / np.sqrt(a.size)
     assert abs(correlation(a, b)) < bound
     assert abs(correlation(a**2, b**2)) < bound
-    for shift in (1, SIZE):
-        assert abs(correlation(a[:-shift], b[shift:])) < bound
-
-
-def test_all_frames_of_a_view_are_independent_of_each_other():
-    pixels = PIXELS[:100_000]
-    stack = np.stack([deviates(42, "mug", "A0", frame, pixels=pixels) for frame in range(52)])
-    matrix = np.corrcoef(stack)[np.triu_indices(52, 1)]
-    assert np.abs(matrix).max() < 5.5 / np.sqrt(pixels.size)
-    assert stats.kstest(matrix * np.sqrt(pixels.size), "norm").pvalue > 1e-3
-    # The noise of a pixel through the frames, as phase shifting uses it.
-    assert abs(stack.mean(axis=0).var() * 52 - 1) < 5 * np.sqrt(2 / pixels.size)
 
 
 def test_names_are_told_apart_where_they_are_joined():
@@ -149,17 +104,9 @@ def test_names_are_told_apart_where_they_are_joined():
 
 
 def test_hash_is_a_bijection_of_the_pixel_number():
-    keys = stream_keys(2**40, "anything")
     sample = np.concatenate([PIXELS, np.arange(2**32 - 500_000, 2**32, dtype=np.uint32)])
-    hashes = hash_pixels(sample, keys)
+    hashes = hash_pixels(sample, stream_keys(2**40, "anything"))
     assert np.unique(hashes).size == sample.size
-    # Each of the 32 bits is set for half of the pixels, and a changed input bit flips each output bit half of the time.
-    shares = np.unpackbits(hashes[:, None].view(np.uint8), axis=1).mean(axis=0)
-    np.testing.assert_allclose(shares, np.full(32, 0.5), atol=0.004)
-    for bit in (0, 7, 19):
-        flipped = hashes[: 1 << 17] ^ hash_pixels(PIXELS[: 1 << 17] ^ np.uint32(1 << bit), keys)
-        shares = [float(((flipped >> np.uint32(k)) & 1).mean()) for k in range(24)]
-        assert min(shares) > 0.4 and max(shares) < 0.6
 
 
 def test_uniform_is_uniform():
@@ -186,9 +133,7 @@ def exposure_of(rig=None, projector=None, **camera):
 WHITE = RIG.sequence.white
 
 
-@pytest.mark.parametrize(
-    ("full_well_e", "read_noise_e", "black_grey"), [(4000.0, 40.0, 10.0), (10500.0, 60.0, 4.0), (1500.0, 6.0, 0.0)]
-)
+@pytest.mark.parametrize(("full_well_e", "read_noise_e", "black_grey"), [(4000.0, 40.0, 10.0), (10500.0, 60.0, 8.0)])
 def test_photon_transfer_curve_gives_gain_and_read_noise_back(full_well_e, read_noise_e, black_grey):
     """EMVA 1288: temporal variance over mean is a line whose slope is the gain, and whose end is the read noise. Its
     quantisation adds 1/12."""
@@ -204,26 +149,10 @@ def test_photon_transfer_curve_gives_gain_and_read_noise_back(full_well_e, read_
     gain, offset = np.polyfit(np.array(means) - black_grey, np.array(variances) - 1 / 12, 1)
     e_per_grey = full_well_e / 255
     assert 1 / gain == pytest.approx(e_per_grey, rel=0.02)
-    if read_noise_e > 30:  # else it is a small part of the shot noise at the darkest level
-        assert np.sqrt(offset) / gain == pytest.approx(read_noise_e, rel=0.02)
-    if black_grey >= 8:  # and in the dark by itself, unclipped
-        dark = exposure.expose([RIG.sequence.black], flat(200.0), PIXELS, (3, "dark"))[0].astype(float)
-        assert dark.mean() == pytest.approx(black_grey, abs=0.01)
-        assert np.sqrt(dark.var() - 1 / 12) * e_per_grey == pytest.approx(read_noise_e, rel=0.01)
-
-
-@pytest.mark.parametrize("sigma", [0.5, 1.0, 3.0])
-def test_variance_is_read_noise_plus_shot_noise_linear_in_the_signal(sigma):
-    exposure = exposure_of(**camera_noise(sigma))
-    for level in (20.0, 60.0, 127.5, 200.0):
-        # Subtracted dither of one grey level makes quantisation an independent error of variance 1/12 (Schuchman 1964).
-        dither = np.random.default_rng(int(level)).random(PIXELS.size).astype(np.float32) - np.float32(0.5)
-        lit = flat(level)
-        lit = replace(lit, ambient=dither)
-        read = exposure.expose([WHITE], lit, PIXELS, (3, level))[0].astype(np.float64) - dither
-        expected = sigma**2 / 2 + sigma**2 / 2 * level / 127.5
-        assert read.mean() == pytest.approx(level, abs=5 * np.sqrt(expected + 0.1) / SIZE)
-        assert read.var() == pytest.approx(expected + 1 / 12, rel=0.01)
+    assert np.sqrt(offset) / gain == pytest.approx(read_noise_e, rel=0.02)
+    dark = exposure.expose([RIG.sequence.black], flat(200.0), PIXELS, (3, "dark"))[0].astype(float)
+    assert dark.mean() == pytest.approx(black_grey, abs=0.01)
+    assert np.sqrt(dark.var() - 1 / 12) * e_per_grey == pytest.approx(read_noise_e, rel=0.01)
 
 
 def test_sigma_is_that_of_mid_grey():
@@ -246,11 +175,10 @@ def ramp_bytes(**camera):
     )[0]
 
 
-@pytest.mark.parametrize("black_grey", [0.0, 4.25])
-@pytest.mark.parametrize("bits", [8, 10, 12])
-@pytest.mark.parametrize("response", [1.0, 0.55, 2.2, (0.0, 0.47, 0.8, 1.0)])
-def test_converter_and_response_against_a_direct_evaluation(bits, response, black_grey):
-    most = 2**bits - 1
+@pytest.mark.parametrize("bits", [8, 12])
+@pytest.mark.parametrize("response", [1.0, 0.55, (0.0, 0.47, 0.8, 1.0)])
+def test_converter_and_response_against_a_direct_evaluation(bits, response):
+    black_grey, most = 4.25, 2**bits - 1
     light = RAMP.astype(np.float64) + black_grey
     code = np.floor(light / 255 * most + 0.5).clip(0, most) / most
     curve = code**response if not isinstance(response, tuple) else np.interp(code, [0, 1 / 3, 2 / 3, 1], response)
@@ -263,21 +191,8 @@ def test_converter_and_response_against_a_direct_evaluation(bits, response, blac
     assert np.abs(read.astype(float) - 255 * curve)[off].max(initial=0) <= steepest + 0.5
 
 
-def test_quantisation_is_unbiased_and_clips_at_the_ends():
-    read = ramp_bytes()
-    np.testing.assert_array_equal(read, np.floor(RAMP.astype(np.float64) + 0.5).clip(0, 255))
-    inside = RAMP < 255
-    assert abs((read[inside] - RAMP[inside].astype(np.float64)).mean()) < 1e-3
-    noisy = exposure_of(**camera_noise(2.0))
-    for level, end in ((0.0, 0), (255.0, 255), (400.0, 255)):
-        read = noisy.expose([WHITE], flat(level), PIXELS, (1, level))[0]
-        assert abs(int(read.min() if end else read.max()) - end) <= 12
-        assert (read == end).mean() > 0.5
-
-
-def test_sigma_zero_gives_no_noise():
-    for seed in range(3):
-        assert (exposure_of().expose([WHITE], flat(99.0, 1000), PIXELS[:1000], (seed, "flat"))[0] == 99).all()
+def test_quantisation_rounds_and_clips_at_the_ends():
+    np.testing.assert_array_equal(ramp_bytes(), np.floor(RAMP.astype(np.float64) + 0.5).clip(0, 255))
 
 
 @pytest.mark.parametrize("bits", [8, 10])
@@ -412,39 +327,19 @@ def test_kernel_and_numpy_give_the_same_bytes(name):
         np.testing.assert_array_equal(read, in_numpy(exposure, FRAMES, part, pixels, (42, "mug", "A0")))
 
 
-@pytest.mark.parametrize("name", ["paper", "hard"])
-def test_light_and_sensor_one_after_the_other_give_the_same_bytes(name):
+def test_light_and_sensor_one_after_the_other_give_the_same_bytes():
     """`radiance` and then `sense`, as with a blurring lens between, is `expose`."""
-    exposure = exposure_under(name)
-    _, _, lit = randomly_lit(exposure, LIGHTS[name])
-    for samples in (1, 4):
-        pixels = np.arange(5000, dtype=np.uint32)
-        part = subset(lit, np.arange(5000 * samples))
-        whole = exposure.expose(FRAMES, part, pixels, (1, "mug", "A0"))
-        light_grey = exposure.radiance(FRAMES, part, (1, "mug", "A0"), np.empty(whole.shape, np.float32))
-        sensed = exposure.sense(FRAMES, light_grey, pixels, (1, "mug", "A0"), np.empty_like(whole))
-        np.testing.assert_array_equal(sensed, whole)
+    exposure = exposure_under("hard")
+    _, _, lit = randomly_lit(exposure, LIGHTS["hard"])
+    pixels = np.arange(5000, dtype=np.uint32)
+    part = subset(lit, np.arange(5000 * 4))
+    whole = exposure.expose(FRAMES, part, pixels, (1, "mug", "A0"))
+    light_grey = exposure.radiance(FRAMES, part, (1, "mug", "A0"), np.empty(whole.shape, np.float32))
+    sensed = exposure.sense(FRAMES, light_grey, pixels, (1, "mug", "A0"), np.empty_like(whole))
+    np.testing.assert_array_equal(sensed, whole)
 
 
-@pytest.mark.parametrize("name", ["paper", "hard"])
-def test_a_subset_of_pixels_reads_the_bytes_of_the_whole_frame(name):
-    exposure = exposure_under(name)
-    _, _, lit = randomly_lit(exposure, LIGHTS[name])
-    pixels = np.arange(lit.gain.size, dtype=np.uint32)
-    chosen = np.flatnonzero(np.random.default_rng(0).random(pixels.size) < 0.1)
-    frames, stream = [0, 3, 10, 21], (1, "mug", "A0")
-    out = np.empty((4, pixels.size), np.uint8)
-    full = exposure.expose(frames, lit, pixels, stream, out)
-    assert full is out
-    for some in (chosen, chosen[::-1].copy(), chosen[:0]):
-        exposed = exposure.expose(frames, subset(lit, some), some.astype(np.uint32), stream)
-        np.testing.assert_array_equal(exposed, full[:, some])
-    # The other frames of a call make no difference either.
-    for row, frame in enumerate(frames):
-        np.testing.assert_array_equal(exposure.expose([frame], lit, pixels, stream)[0], full[row])
-
-
-@pytest.mark.parametrize("index", [0, 5, 18, 30, 42, 49, 50, 51])
+@pytest.mark.parametrize("index", [0, 30, 42, 51])
 def test_pattern_lookup_is_opencv_remap_of_the_pattern_image(index):
     """Bilinear lookup against cv2.remap on the projected image itself: OpenCV rounds weights to 1/32 px."""
     exposure = exposure_of(rays_across=1, full_well_e=None)

@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-import trimesh
-from rendering import PAPER, RIG, solid, studio
+from rendering import PAPER, RIG
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEW_DEGREES
 from fpp_ml_bench.loaders.render.light import SurfaceLight
 from fpp_ml_bench.loaders.render.lighting import Lighting
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.raycast import TracedObject
-from fpp_ml_bench.loaders.render.scene import SolidMesh, turned, unturned
+from fpp_ml_bench.loaders.render.scene import SolidMesh, turned
 from fpp_ml_bench.loaders.render.textures import CHECK_MM, KINDS, MAPS, checks, material_of, smooth_noise
 
 RNG = np.random.default_rng(7)
@@ -99,21 +98,3 @@ def test_a_map_sticks_to_its_object_in_every_view():
             # Ambient light is not shaped by place or direction: it is the albedo's.
             off = np.abs(lit.ambient - light.ambient_grey * expected / light.surface.albedo) > 1e-4
             assert off.mean() < 2e-3  # rounding at the very edge of a letter
-
-
-def test_unturned_undoes_turned():
-    points = RNG.normal(size=(50, 3))
-    for degrees in VIEW_DEGREES:
-        np.testing.assert_allclose(unturned(turned(points, degrees), degrees), points, atol=1e-14)
-
-
-def test_contrast_zero_changes_no_byte_of_a_view():
-    mug = solid(trimesh.creation.icosphere(3, 0.1), "mug")  # a mug has checks
-    plain = studio(PAPER, stored="single_shot").photograph(mug, "A60")
-    first = plain.frames[0].copy(), plain.depth_mm
-    printed = studio(PAPER.changed("surface", textures="by_kind", contrast=0.0), stored="single_shot")
-    row = printed.photograph(mug, "A60")
-    np.testing.assert_array_equal(row.frames[0], first[0])
-    np.testing.assert_array_equal(row.depth_mm, first[1])
-    checked = studio(PAPER.changed("surface", textures="by_kind", contrast=0.9), stored="single_shot")
-    assert (checked.photograph(mug, "A60").frames[0] != first[0])[plain.depth_exact_mm > 0].mean() > 0.2
