@@ -28,6 +28,7 @@ DOORS = {
         "baselines/registry.py",  # of the parent process
         "baselines/run.py",  # the shape of a prediction that it made itself
         "fpp_ml_bench/pool.py",  # between the nodes of one cluster
+        "loaders/render/meshes.py",  # the objects, which come with the package
         "loaders/captures/decoding.py",  # bytes of bounded size
     },
     r"mmap\.mmap": {"loaders/storage/store.py"},  # of memory, of no file
