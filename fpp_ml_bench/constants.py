@@ -5,10 +5,17 @@ list of its objects. The paper does not list the split; it is defined here, with
 figures in test.
 """
 
+import math
 import re
 
 SCHEMA_VERSION = "3.0.0"
 
+TAU = 2 * math.pi
+GOLDEN = 0.6180339887498949
+"""Inverse of the golden ratio. Multiples of it, without their whole part, fill the interval from 0 to 1 evenly."""
+PLASTIC = 0.7548776662466927
+"""Inverse of the plastic number: multiples of it do so too, and with those of its square they fill the plane evenly
+(the sequence R2, Roberts 2018)."""
 MM_PER_M = 1000.0
 GREY_LEVELS = 255
 LARGEST_SIDE_PX = 8192

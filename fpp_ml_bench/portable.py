@@ -75,3 +75,8 @@ def gaussian_weights(variance: float, sigmas: float = 4.0) -> NDArray[np.float64
     reach = math.ceil(sigmas * math.sqrt(variance))
     weights = exponential(np.arange(-reach, reach + 1.0) ** 2 / (-2.0 * variance))
     return weights / math.fsum(weights)
+
+
+def matrix_product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrix product of (3, 3) and (3, n), added in order."""
+    return a[:, :1] * b[0] + a[:, 1:2] * b[1] + a[:, 2:] * b[2]

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, TAU
 from fpp_ml_bench.decoding.triangulation import FIXED_POINT_STEPS, rotated_ray
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.pinhole import Coefficients, Maps, distortion_polynomial, is_distorted
@@ -38,7 +38,6 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Crop = tuple[slice, slice]
 
-TAU = 2 * np.pi
 LEAST_RANGE_RAD = 1.0
 """Least change of the joint phase over the working range for crossed fringes to tell a depth at all."""
 RESAMPLED_JUMP_RAD = 1.0

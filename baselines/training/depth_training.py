@@ -44,7 +44,7 @@ from fpp_ml_bench.baselines.training.engine import (
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
 from fpp_ml_bench.baselines.training.recipe import GAN, Linear, Plateau, Recipe
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
-from fpp_ml_bench.constants import MM_PER_M, SPLITS, split_sample_name
+from fpp_ml_bench.constants import GOLDEN, MM_PER_M, SPLITS, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -64,7 +64,6 @@ SCORING: dict[Normalisation, tuple[Units, Mode]] = {
 LOGGED = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
 LEAST_GAIN = 1e-4
 """Share by which a loss must be below the best one to count as lower."""
-_GOLDEN = (5**0.5 - 1) / 2
 _RELATIVE = 1e-9
 """1e-4 x 0.1 x 0.1 is 1.0000000000000002e-06: a rate this near to its minimum has reached it."""
 
@@ -148,7 +147,7 @@ def spread(pairs: int, drawn: int | None) -> list[int]:
     a place that walks through it by the golden ratio, so that views and the frames within them come evenly."""
     if drawn is None or drawn >= pairs:
         return list(range(pairs))
-    return [int((place + place * _GOLDEN % 1) * pairs / drawn) for place in range(drawn)]
+    return [int((place + place * GOLDEN % 1) * pairs / drawn) for place in range(drawn)]
 
 
 def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:

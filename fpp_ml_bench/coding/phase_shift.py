@@ -34,11 +34,10 @@ from fpp_ml_bench.coding.code import (
     whole,
 )
 from fpp_ml_bench.coding.gray_code import GrayCells
-from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.constants import GREY_LEVELS, TAU
 from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
-TAU = 2 * math.pi
 CLEAR_RATIO = 4.0
 """An order is taken where every other one fits at least so many times worse (in squares): a third of the way to the
 middle between two candidates remains."""

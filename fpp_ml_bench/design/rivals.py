@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import MM_PER_M, TAU
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.rig import Rig
 
 GRID = 5
 """Pixels along each side of the image, corners included."""
 _STEP_M = 1e-4
-TAU = 2 * math.pi
 _TINY = float(np.finfo(np.float64).tiny)
 
 

@@ -21,7 +21,7 @@ from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import did_you_mean
-from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+from fpp_ml_bench.portable import cosine_of_turns, matrix_product, sine_of_turns
 
 if TYPE_CHECKING:  # the name of a benchmark needs settings alone
     from fpp_ml_bench.loaders.render.paint import Paint
@@ -198,22 +198,17 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
         turn = np.array(draws[:3]) * (scale / 2)
         cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
         small = np.eye(3) + 2.0 / (1.0 + float((turn * turn).sum())) * (
-            cross + _product(cross, cross)
+            cross + matrix_product(cross, cross)
         )  # Cayley's formula
         shifted = {"cx": draws[3] * scale * rig.projector.fx, "cy": draws[4] * scale * rig.projector.fx}
         projector = replace(rig.projector, cx=rig.projector.cx + shifted["cx"], cy=rig.projector.cy + shifted["cy"])
-        first, second, third = (tuple(row) for row in _product(small, rig.R).tolist())
-        tx, ty, tz = _product(small, rig.t[:, None]).ravel().tolist()
+        first, second, third = (tuple(row) for row in matrix_product(small, rig.R).tolist())
+        tx, ty, tz = matrix_product(small, rig.t[:, None]).ravel().tolist()
         other = replace(rig, projector=projector, rotation=(first, second, third), translation_m=(tx, ty, tz))
         u, v = other.project(points)
         squares = (u - before[0]) ** 2 + (v - before[1]) ** 2
         scale *= calibration_px / float(np.sqrt(np.nanmean(squares)))
     return other
-
-
-def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix product of (3, 3) and (3, n), added in order: the same bits on every processor."""
-    return a[:, :1] * b[0] + a[:, 1:2] * b[1] + a[:, 2:] * b[2]
 
 
 def name_bytes(*name: object) -> bytes:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from fpp_ml_bench.constants import GOLDEN, PLASTIC
 from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.machine import njit
@@ -25,9 +26,7 @@ SURFELS = 3000
 """Aimed at on flat ground; an object has up to three times as many, by its slopes and steps."""
 RAYS = 64
 """From each surfel. A point's light comes from several surfels, so their noise is small (docs/light.md)."""
-_SECOND, _THIRD = 0.7548776662466927, 0.5698402909980532
-"""Steps of the plane-filling sequence R2 (Roberts 2018): the inverse of the plastic number, and its square."""
-_GOLDEN = 0.6180339887498949
+_PLASTIC_SQUARED = 0.5698402909980532
 _OFFSET_M = 1e-5
 OFF_PLANE = 15.0
 """Distance along the normal counts four times: a surfel on another step is not beside the point."""
@@ -86,8 +85,8 @@ class Surfels:
         traced = TracedObject(mesh, mesh.vertices_m)
         points, grid = place_surfels(_sides(mesh), len(mesh.faces))
         count = len(grid.area_m2)
-        turn = np.arange(count) * _GOLDEN
-        disk = np.arange(RAYS) * _GOLDEN
+        turn = np.arange(count) * GOLDEN
+        disk = np.arange(RAYS) * GOLDEN
         height = (np.arange(RAYS) + 0.5) / RAYS
         radius = np.sqrt(height)
         local = np.column_stack([radius * cosine_of_turns(disk), radius * sine_of_turns(disk), np.sqrt(1.0 - height)])
@@ -130,7 +129,7 @@ def place_surfels(corners: NDArray[np.float64], faces: int | None = None) -> tup
     area_m2 = float(behind[-1])
     number = np.arange(POINTS)
     triangle = np.minimum(np.searchsorted(behind, (number + 0.5) * (area_m2 / POINTS), "right"), len(corners) - 1)
-    first, second = np.sqrt((0.5 + number * _SECOND) % 1.0), (0.5 + number * _THIRD) % 1.0
+    first, second = np.sqrt((0.5 + number * PLASTIC) % 1.0), (0.5 + number * _PLASTIC_SQUARED) % 1.0
     weights = np.stack([1.0 - first, first * (1.0 - second), first * second], axis=1)
     chosen = corners[triangle]
     position = weights[:, :1] * chosen[:, 0] + weights[:, 1:2] * chosen[:, 1] + weights[:, 2:] * chosen[:, 2]

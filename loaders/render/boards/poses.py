@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import GOLDEN, MM_PER_M, PLASTIC
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.loaders.render.scene import along_rays
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+from fpp_ml_bench.portable import cosine_of_turns, matrix_product, sine_of_turns
 
 BOARD_POSES = 18
 """As many as the paper takes (Section 2.3)."""
@@ -30,8 +30,6 @@ MOST_TILT, LEAST_TILT = 30 / 360, 0.4
 NICE = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 _STEPS = 20
 _MARGIN_PX = 2.0
-_GOLDEN, _PLASTIC = 0.6180339887498949, 0.7548776662466927
-"""Multiples of these, without their whole part, fill the interval from 0 to 1 evenly."""
 _PLACES = ((0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, 0), (1, 0))
 
 
@@ -82,12 +80,14 @@ def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES) -> tuple[Board
     middle, reach = _seen_by_both(rig)
     poses = []
     for index in range(count):
-        share = 1.0 if count == 1 else LEAST_TILT + (1 - LEAST_TILT) * (index * _PLASTIC % 1.0)
+        share = 1.0 if count == 1 else LEAST_TILT + (1 - LEAST_TILT) * (index * PLASTIC % 1.0)
         roll = 0.25 * (index % 2) + 0.03 * (index % 3 - 1)
-        rotation = _product(_tilt(MOST_TILT * share, index * _GOLDEN % 1.0), _roll(roll))
+        tilt, rolled = (np.array(rows) for rows in (_tilt(MOST_TILT * share, index * GOLDEN % 1.0), _roll(roll)))
+        first, second, third = (tuple(row) for row in matrix_product(tilt, rolled).tolist())
+        rotation = first, second, third
         place = np.array(_PLACES[index % len(_PLACES)]) * reach
         about = BoardPose(rotation, (0.0, 0.0, 0.0)).points_m(corners - centre)
-        pose = _fitting_pose(rig, rotation, about, centre, middle, place, index * _GOLDEN % 1.0)
+        pose = _fitting_pose(rig, rotation, about, centre, middle, place, index * GOLDEN % 1.0)
         if pose is None:
             size = f"{MM_PER_M * (right - left):g} x {MM_PER_M * (bottom - top):g} mm"
             raise CalibrationError(
@@ -157,7 +157,3 @@ def _tilt(turns: float, azimuth_turns: float) -> tuple:
 def _roll(turns: float) -> tuple:
     c, s = float(cosine_of_turns(turns)), float(sine_of_turns(turns))
     return (c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)
-
-
-def _product(first: tuple, second: tuple) -> tuple:
-    return tuple(tuple(sum(row[k] * second[k][j] for k in range(3)) for j in range(3)) for row in first)
