@@ -11,10 +11,8 @@ import scipy.io
 import trimesh
 from conftest import TINY_CONFIGS, TINY_OBJECTS, file_bytes
 from published_trees import command, imported, write_png
-from scored_dataset import write_predictions
 
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
-from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import whole_folder
 from fpp_ml_bench.loaders.published import exporting as export_tree
 from fpp_ml_bench.loaders.published.exporting import chosen_splits, export
@@ -59,15 +57,6 @@ def test_the_tree_comes_back_bit_by_bit_with_the_same_split(opened, returned):
         for index in range(52):
             assert np.array_equal(returned.frame(sample, index), opened.frame(sample, index))
     assert returned.manifest.settings["frame_order"] == "paper"
-
-
-@pytest.mark.parametrize("split", ["test", "all"])
-def test_predictions_score_the_same_on_both(opened, returned, tmp_path, split):
-    predictions = write_predictions(tmp_path / "predictions", opened, split, offset_mm=1.7, noise_mm=20.0)
-    # The published layout has no flags, so its sets are the paper's.
-    original, reimported = (evaluate(predictions, dataset, split, mode="paper") for dataset in (opened, returned))
-    assert original.metrics == reimported.metrics and original.per_sample == reimported.per_sample
-    assert original.metrics.object_mae_mm > 1
 
 
 @pytest.mark.parametrize("variant", ["global_normalized", "individual_normalized"])
@@ -166,17 +155,9 @@ BROKEN_SCANS = {
     "view missing": (lambda f: shutil.rmtree(f), "A60: the raw scan is missing"),
     "scan without depth": (lambda f: shutil.copytree(f, f.parents[1] / "mug/A60"), "A60: a raw scan without depth"),
     "no view at all": (lambda f: (f.parent / "A45").mkdir(), "A45: does not belong here"),
-    "frame of 16 bits": (
-        lambda f: write_png(f / "A_9.png", np.zeros((176, 176), np.uint16)),
-        "A_9.png: expected an 8-bit PNG, got 16 bits",
-    ),
     "frame of another size": (
         lambda f: write_png(f / "A_9.png", np.zeros((88, 88), np.uint8)),
         "A_9.png: expected 176 x 176 px",
-    ),
-    "frame damaged": (
-        lambda f: (f / "A_9.png").write_bytes((f / "A_9.png").read_bytes()[:-500]),
-        "A_9.png: the PNG is cut off",
     ),
     "not the single-shot frame": (lambda f: shutil.copy(f / "A_1.png", f / "A_0.png"), "A_0.png: differs from"),
     "two frames exchanged": (lambda f: swap(f / "A_20.png", f / "A_23.png"), "A_20.png: expected vertical sinusoid"),
@@ -328,26 +309,13 @@ def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp
         ("{data}", "--out", "out"),
         ("nowhere", "--out", "out", "--mat"),
         ("{data}", "--out", "file", "--mat"),
-        ("{data}", "--out", "full", "--mat"),
         ("{data}", "--out", "{data}", "--parquet"),
-        ("/dev/null", "--out", "out", "--patterns"),
-        ("{data}", "--out", "/proc/none/out", "--patterns"),
+        ("{data}", "--out", "out", "--parquet", "--split", "val"),
     ],
 )
 def test_bad_input_to_the_command_is_a_message_and_status_2(tiny, tmp_path, monkeypatch, capsys, words):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
-    Path("full").mkdir()
-    Path("full/mine").write_text("")
     assert command("export", *(word.format(data=tiny) for word in words)) == 2
     message = capsys.readouterr().err
     assert "error:" in message and "Traceback" not in message and not Path("out").exists()
-
-
-def test_an_unknown_split(opened, tmp_path, tiny):
-    folder = tmp_path / "one"
-    export(opened, tmp_path / "tree", ["mat"], ["test"])
-    dataset = imported(tmp_path / "tree", folder)
-    with pytest.raises(DatasetError, match="no split 'train'"):
-        chosen_splits(dataset, "train")
-    assert command("export", folder, "--out", tmp_path / "out", "--parquet", "--split", "train") == 2

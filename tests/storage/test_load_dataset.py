@@ -9,7 +9,7 @@ import datasets
 import numpy as np
 import pyarrow as pa
 import pytest
-from conftest import TINY_CONFIGS, TINY_SIZE, tiny_settings
+from conftest import TINY_CONFIGS, tiny_settings
 from synthetic import SyntheticRows, make
 
 import fpp_ml_bench
@@ -146,7 +146,7 @@ def test_new_data_in_the_same_folder_is_not_read_out_of_the_old_cache(tmp_path):
 
 
 def test_usual_operations(tiny, opened, tmp_path):
-    folder = tmp_path / "copy"  # `filter` and `map` leave their caches beside the data
+    folder = tmp_path / "copy"  # `filter` leaves its cache beside the data
     shutil.copytree(tiny, folder)
     dataset = load_dataset(folder, "vertical", split="train")
     shuffled = dataset.shuffle(seed=3)
@@ -158,16 +158,8 @@ def test_usual_operations(tiny, opened, tmp_path):
         np.testing.assert_array_equal(row["frame_20"], opened.frame(row["sample"], 20))
     filtered = dataset.filter(lambda view: view == "A60", input_columns="view")
     assert filtered["sample"][:] == ["bowl_A60", "cork_A60"]
-    mapped = dataset.select(range(2)).map(lambda row: {"top": max(map(max, row["depth"]))})
-    assert mapped["top"][:] == [float(opened.depth_mm(s).max()) for s in opened.splits["train"][:2]]
-    import torch
-
-    row = dataset.with_format("torch", columns=["frame_18", "depth"], dtype=torch.float32)[0]
-    assert row["frame_18"].dtype == torch.float32 and row["frame_18"].shape == (TINY_SIZE, TINY_SIZE)
     again = pickle.loads(pickle.dumps(dataset))
     np.testing.assert_array_equal(again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"]))
-    joined = datasets.concatenate_datasets([dataset, load_dataset(folder, "vertical", split="test")])
-    assert len(joined) == 18
     assert verify(folder) == []  # verify ignores those caches
 
 
@@ -181,20 +173,16 @@ def test_fingerprints_follow_the_data(tiny, tmp_path):
     assert len(other_fingerprints | {fingerprint}) == 3
 
 
-@pytest.mark.parametrize("config", TINY_CONFIGS)
-@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize(("config", "exact"), [("single_shot", False), ("all", True)])
 def test_schema_is_what_datasets_itself_would_write(config, exact):
     columns = config_columns(PAPER_SEQUENCE, config, exact)
-    expected_features = datasets.Features(
-        {
-            name: datasets.Value("string")
-            if name in ("sample", "object", "view", "split")
-            else datasets.Value("float32")
-            if name in ("depth_min", "depth_max")
-            else datasets.Array2D((120, 160), "float32" if name.startswith("depth") else "uint8")
-            for name in columns
-        }
-    )
+    expected_features = datasets.Features({name: datasets.Array2D((120, 160), "uint8") for name in columns})
+    for name in ("sample", "object", "view", "split"):
+        expected_features[name] = datasets.Value("string")
+    for name in ("depth_min", "depth_max"):
+        expected_features[name] = datasets.Value("float32")
+    for name in ("depth", "depth_exact") if exact else ("depth",):
+        expected_features[name] = datasets.Array2D((120, 160), "float32")
     # Through a file, as a reader gets it: with `datasets` imported, the extension type comes from the metadata.
     schema, expected = (
         pa.ipc.read_schema(arrow_schema(features(columns, (120, 160))).serialize()),
@@ -210,7 +198,6 @@ def test_schema_is_what_datasets_itself_would_write(config, exact):
     ("config", "split", "message"),
     [
         ("both", "train", "unknown configuration 'both'"),
-        ("single_shot", "val", "no split 'val'"),
         ("single_shot", "all", "expected one of train, validation, test, or None"),
     ],
 )

@@ -45,13 +45,6 @@ def test_it_loads_as_one_split(unseen):
         load_dataset(unseen, split="train")
 
 
-def test_the_hub_libraries_own_readers_take_it(unseen):
-    import datasets
-
-    assert len(datasets.load_from_disk(str(unseen))["test"]) == 12
-    assert list(datasets.load_dataset(str(unseen), "single_shot")) == ["test"]
-
-
 def test_a_method_runs_on_it_and_is_scored(unseen, tmp_path, capsys):
     predictions, result = tmp_path / "predictions", tmp_path / "result.json"
     assert main(["predict", "classical", str(unseen), "--out", str(predictions)]) == 0
