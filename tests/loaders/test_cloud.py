@@ -108,15 +108,14 @@ def test_refused_points(points_mm, grey, said):
         cloud_html("none", points_mm, grey)
 
 
-def test_command(tmp_path, capsys):
-    data, picture = tmp_path / "data", tmp_path / "pictures" / "pen.png"
-    assert main(["build", "--out", str(data), "--objects", "pen", "--size", "176", "--config", "single_shot"]) == 0
-    assert main(["show", str(data), "pen_A0", "--out", str(picture), "--cloud"]) == 0
+def test_command(tiny, tmp_path, capsys):
+    picture = tmp_path / "pictures" / "mug.png"
+    assert main(["show", str(tiny), "mug_A0", "--out", str(picture), "--cloud"]) == 0
     names = [picture, picture.with_suffix(".ply"), picture.with_suffix(".html")]
     assert capsys.readouterr().out.splitlines()[-3:] == [str(name) for name in names]
-    assert all(name.is_file() for name in names) and "pen_A0: exact depth" in names[2].read_text()
+    assert all(name.is_file() for name in names) and "mug_A0: exact depth" in names[2].read_text()
     assert len(trimesh.load(names[1]).vertices) == len(held(names[2].read_bytes())["places"]) > 50
-    assert main(["show", str(data), "--sheet", "--cloud"]) == 2
+    assert main(["show", str(tiny), "--sheet", "--cloud"]) == 2
     assert "expected a SAMPLE" in capsys.readouterr().err
 
 

@@ -23,13 +23,6 @@ from fpp_ml_bench.loaders.storage.verification import verify
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 datasets.disable_progress_bars()
-IMAGES = ("frame_00", "depth", "depth_exact", "flags", "cover")
-
-
-def rows_by_sample(dataset, columns):
-    """Arrays by sample and column, through the numpy format of `datasets`."""
-    formatted = dataset.with_format("numpy", columns=["sample", *columns])
-    return {row["sample"]: {c: row[c] for c in columns} for row in formatted}
 
 
 @pytest.mark.parametrize("config", TINY_CONFIGS)
@@ -69,25 +62,6 @@ def test_all_splits_at_once_and_the_lazy_name(tiny, opened):
     assert parts["train"].info.config_name == "single_shot"
 
 
-def test_plain_load_dataset_and_load_from_disk_give_the_same_values(tiny):
-    joined = load_dataset(tiny, "single_shot", split="train")
-    plain = datasets.load_dataset(str(tiny), "single_shot", split="train")
-    default = datasets.load_dataset(str(tiny), split="train")
-    in_place = datasets.load_from_disk(str(tiny))
-    assert sorted(in_place) == ["test", "train", "validation"]
-    expected = rows_by_sample(joined, IMAGES)
-    assert len(expected) == 12
-    for loaded in (plain, default, in_place["train"]):
-        assert loaded.column_names == joined.column_names
-        assert loaded.features == joined.features
-        values = rows_by_sample(loaded, IMAGES)
-        assert list(values) == list(expected)
-        for sample, images in expected.items():
-            for column, image in images.items():
-                np.testing.assert_array_equal(values[sample][column], image)
-    assert datasets.get_dataset_split_names(str(tiny), "single_shot") == ["train", "validation", "test"]
-
-
 def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
     """Nine objects of a split are two files of 30 and 24 rows."""
     folder = make(tmp_path / "set", {"train": OBJECTS[:9], "test": ("power_drill",)}, origin="imported")
@@ -96,10 +70,13 @@ def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
     expected = [f"{name}_{view}" for name in OBJECTS[:9] for view in VIEWS]
     datasets_by_way = {
         "joined": load_dataset(folder, split="train"),
-        "plain": datasets.load_dataset(str(folder), split="train"),
+        "plain": datasets.load_dataset(str(folder), "single_shot", split="train"),
+        "without its configuration": datasets.load_dataset(str(folder), split="train"),
         "in place": datasets.load_from_disk(str(folder))["train"],
     }
+    assert datasets.get_dataset_split_names(str(folder), "single_shot") == ["train", "test"]
     for dataset in datasets_by_way.values():
+        assert dataset.features == datasets_by_way["joined"].features
         assert dataset["sample"][:] == expected == folder_read.splits["train"]
         formatted = dataset.with_format("numpy")
         for row in (0, 29, 30, 53):
@@ -109,15 +86,6 @@ def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
     alone = SyntheticRows().row(expected[30], *split_sample_name(expected[30]))
     np.testing.assert_array_equal(folder_read.frame(expected[30], 0), alone.frames[0])
     np.testing.assert_array_equal(folder_read.depth_mm(expected[30]), alone.depth_mm)
-
-
-def test_in_place_reading_copies_nothing_into_a_cache(tiny):
-    joined = load_dataset(tiny, "all", split="train")
-    assert joined.cache_files == [] or all(str(tiny) in f["filename"] for f in joined.cache_files)
-    before = {p for p in Path(datasets.config.HF_DATASETS_CACHE).rglob("*") if p.is_file()}
-    rows_by_sample(joined, ["frame_00", "frame_51"])
-    after = {p for p in Path(datasets.config.HF_DATASETS_CACHE).rglob("*") if p.is_file()}
-    assert before == after
 
 
 def test_memory_is_the_files_own_map(tiny):
