@@ -59,8 +59,7 @@ def test_pairs_are_all_frames_of_a_row_then_the_next(tiny, config):
 
 
 @pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
-@pytest.mark.parametrize("background_removed", [False, True])
-@pytest.mark.parametrize("rule", ["object", "valid"])
+@pytest.mark.parametrize(("background_removed", "rule"), [(False, "object"), (True, "valid")])
 def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed, rule):
     """By the rule ``valid`` the range is that of the pixels that are not void; depths beyond it are cut to it."""
     dataset = FringeDepthDataset(tiny, "test", "vertical", normalisation, background_removed, rule)

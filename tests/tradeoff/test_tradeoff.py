@@ -364,6 +364,7 @@ def test_the_command_measures(tiny, tmp_path, capsys, monkeypatch):
 def test_sizes_are_smaller_where_the_fringes_allow_it(tiny, tmp_path):
     plan = planned(tiny, tmp_path, ["constant"])
     assert [rig.camera.width for rig in plan.rigs] == [176, 249, 352]
+    plan = planned(tiny, tmp_path, ["constant"])
     plan.opened.__dict__["rig"] = paper_rig(480)
     assert [rig.camera.width for rig in plan.rigs] == [240, 339, 480]
     assert [len(frames) for frames in plan.scenes[:1]] == [52]
