@@ -10,7 +10,7 @@ import yaml
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
-from fpp_ml_bench.optics.rig_file import load_rig
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 SIZE = 240
 
@@ -66,10 +66,14 @@ def test_from_captures_a_wrong_spacing_scales_the_rig(virtual, tmp_path):
     [
         ((), "expected one of CAPTURES"),
         (("BOARDS",), "need --board"),
+        (("BOARDS", "--board", "circles:5x9:50:15"), "need --board"),
         (("BOARDS", "--board", "circles:7x9:50:15", "--sequence", "TRUE"), "was not found"),
+        (("BOARDS", "--board", "BOARD", "--sequence", "TRUE", "--baseline", "-1"), "baseline_mm: expected a positive"),
+        (("BOARDS", "--board", "BOARD", "--sequence", "other.yaml"), "expected 52 frames, found 22"),
         (("BOARDS", "--board", "BOARD", "--sequence", "ONE"), "codes vertical only"),
         (("NOWHERE", "--board", "BOARD", "--sequence", "TRUE"), "no such folder"),
         (("BOARDS", "--board", "circles:5x9:0.05:0.015", "--sequence", "TRUE"), "--board, in mm, gives a baseline of"),
+        (("--virtual", "boards", "--size", "20"), "--size 20: expected 64"),
         (("--virtual", "boards", "--size", "240", "--board", "circles:5x9:500:150"), "does not fit"),
     ],
 )
@@ -77,6 +81,7 @@ def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     vertical = {"scheme": "phase-shift", "pitches_px": [48, 912], "steps": 3}
     one = {"projector": {"width": 912, "height": 1140}, "sequence": {"vertical": vertical}}
+    save_rig(paper_rig(SIZE), tmp_path / "other.yaml")
     (tmp_path / "one.yaml").write_text(yaml.safe_dump(one))
     places = {
         "BOARDS": virtual / "boards",
@@ -129,6 +134,14 @@ def test_changed_captures_are_refused(virtual, tmp_path, capsys, case):
     words = ("--board", "circles:5x9:50:15", "--sequence", virtual / "true.yaml", "--out", tmp_path / "rig.yaml")
     assert calibrate(tmp_path / "boards", *words) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "rig.yaml").exists()
+
+
+def test_two_poses_are_too_few(virtual, tmp_path, capsys):
+    for pose in ("pose_00", "pose_01"):
+        shutil.copytree(virtual / "boards" / pose, tmp_path / "boards" / pose)
+    words = ("--board", "circles:5x9:50:15", "--sequence", virtual / "true.yaml")
+    assert calibrate(tmp_path / "boards", *words, "--out", tmp_path / "rig.yaml") == 2
+    assert "at least 3 poses of the board, found 2" in capsys.readouterr().err
 
 
 def test_poses_that_are_refused_calibrate_anyway_and_are_named(virtual, tmp_path, capsys):

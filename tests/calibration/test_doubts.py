@@ -63,6 +63,7 @@ def test_an_irregular_board_and_panels_of_oblong_pixels_are_not_doubted():
     ("poses", "options", "said"),
     [
         (shown(clean(), keystone(0.15, 0.25)), {}, r"warning: the projector's pixels seem skewed by .0\.\d+ px per px"),
+        (shown(clean(), keystone(-0.04, 0.06)), {}, r"warning: the projector's pixels seem skewed .* explains \d\d%"),
         (shown(clean(), keystone(0.15, 0.2)), {"estimate_board": True}, "warning: the projector's pixels seem skewed"),
         (shown(clean(), keystone(0, 0.3)), {}, r"note: the projector's fx / fy is 1\.\d+, expected 0.99\d+ to 1.0"),
         (clean(BOARD.points_mm() * [1, 1.02, 1]), {}, r"columns seem farther apart than its rows by -(1\.9|2\.0)\d%"),
@@ -95,6 +96,7 @@ def test_one_cause_is_named_once():
     [
         (0.1, r"baseline in mm is 18\.\d+, expected 30"),
         (1 / 25.4, "board's longer side in mm is 5.6"),
+        (12, "side .* 1728"),
     ],
 )
 def test_a_board_in_another_unit_is_named(factor, figures):

@@ -110,10 +110,10 @@ def flat(tilt=0.0):
     return 1800 / (1 + tilt * x + 0.5 * tilt * y)
 
 
-def mirrored():
+def mirrored(side):
     v = view()
     periods = v.periods.copy()
-    periods[0] = 912 / 24 - periods[0]
+    periods[side] = (912 / 24, 1140 / 20)[side] - periods[side]
     return v._replace(periods=periods)
 
 
@@ -128,12 +128,14 @@ def scrambled():
     [
         ([view(depth_mm=flat(0.5))], "flat"),
         ([view(depth_mm=flat(), noise=0.002)], "flat"),
-        ([mirrored()], "mirrored"),
+        ([mirrored(0)], "mirrored"),
+        ([mirrored(1)], "mirrored"),
         ([scrambled()], "no projector explains"),
+        ([], "at least 200 pixels"),
         ([view(depth_mm=np.where(X < -0.95, surface_mm(), 0))], "at least 200 pixels"),
         ([view(centre=(-200.0, 569.5))], "outside the pattern"),
     ],
-    ids=["tilted", "noisy flat", "mirrored u", "scrambled", "few", "centre outside"],
+    ids=["tilted", "noisy flat", "mirrored u", "mirrored v", "scrambled", "none", "few", "centre outside"],
 )
 def test_what_does_not_determine_a_projector_is_refused(views, message):
     with pytest.raises(CalibrationError, match=message):

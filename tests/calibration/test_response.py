@@ -12,8 +12,8 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 
-def test_gamma_is_that_of_the_light(tmp_path):
-    gamma = 1.6
+@pytest.mark.parametrize("gamma", [1.0, 1.6])
+def test_gamma_is_that_of_the_light(tmp_path, gamma):
     data = paper_rig(480).to_dict()
     del data["pitch_px"]
     codes = {

@@ -81,6 +81,7 @@ def nan(): return Odd("nan")
 def several(): return Odd("tuple")
 def fails(): return Odd("fails")
 def raises(): raise RuntimeError("no weights here")
+def number(): return 3
 """
 
 
@@ -183,6 +184,7 @@ def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tin
         ("MINE:several", (), "got tuple"),
         ("MINE:fails", (), "on fringes of shape (1, 1, 176, 176) it failed"),
         ("MINE:raises", (), "RuntimeError: no weights here"),
+        ("MINE:number", (), "expected it to return a torch module, got int"),
         ("classical", ("--layers", "enc1"), "has no layers"),
         ("phase", ("--units", "mm"), "its units are known"),
     ],

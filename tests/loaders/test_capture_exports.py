@@ -74,7 +74,7 @@ def test_triangles_of_a_plane_are_its_normal_and_cover_it():
     np.testing.assert_allclose(across / np.sqrt((across**2).sum(-1, keepdims=True)), [PLANE] * len(faces), atol=1e-9)
 
 
-@pytest.mark.parametrize("missing", [(0, 1), (1, 1)])
+@pytest.mark.parametrize("missing", [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_three_pixels_of_a_square_make_a_triangle(missing):
     camera = Pinhole(2, 2, 90.0, 90.0, 0.5, 0.5)
     depth = np.full((2, 2), 500.0)
@@ -141,6 +141,7 @@ def test_the_grey_image_is_stored_unrounded(written):
 @pytest.mark.parametrize(
     ("largest_mm", "name"),
     [
+        (60.0, "depth_0.001mm.png"),
         (600.0, "depth_0.01mm.png"),
         (65534.0, "depth_1mm.png"),
         (65535.0, "depth_10mm.png"),
@@ -215,7 +216,7 @@ def test_what_a_decoding_wrote_is_removed_the_report_first(tmp_path, monkeypatch
     assert not (tmp_path / "absent").exists()
 
 
-@pytest.mark.parametrize("name", ["notes.txt", ".depth.npy.7.tmp", "depth_mm.npy"])
+@pytest.mark.parametrize("name", ["notes.txt", "depth.npy.bak", ".depth.npy", ".depth.npy.7.tmp", "depth_mm.npy"])
 def test_other_files_are_named_before_anything_is_removed(tmp_path, name):
     folder = _filled(tmp_path / "out", name)
     before = sorted(folder.iterdir())

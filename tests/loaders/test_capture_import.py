@@ -298,6 +298,7 @@ BAD = {
     "dark": (of_frames(lambda image: image // 40), "refused as low modulation: probably the fringes are too faint"),
     "overexposed": (of_frames(lambda image: np.minimum(image.astype(int) * 5 + 170, 255)), "refused as .*: probably"),
     "another range": (of_rig(working_range_mm=[900, 1000], standoff_m=0.95), "nothing in the range: .*another working"),
+    "unknown colour": (lambda f: ("--colour", "cyan"), "colour: expected luminance"),
     "impossible limit": (lambda f: ("--min-modulation", -1), "min_modulation: expected a positive"),
     "frame order": (lambda f: ("--frame-order", "paper"), "belongs to published trees"),
 }

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import TINY_CONFIGS
+from synthetic import make
 from torch.utils.data import DataLoader
 
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
@@ -151,6 +152,11 @@ def test_data_loader_gives_the_same_batches_from_a_spawned_worker(tiny):
         assert int(batch.row[place]) == index
         assert torch.equal(batch.depth[place], dataset[index].depth)
         assert torch.equal(batch.fringe[place], dataset[index].fringe)
+
+
+def test_configuration_that_is_not_stored(tmp_path):
+    with pytest.raises(DatasetError, match="no configuration 'all'; there are single_shot"):
+        FringeDepthDataset(make(tmp_path / "set"), "train", "all")
 
 
 @pytest.mark.parametrize(

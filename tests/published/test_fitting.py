@@ -75,10 +75,11 @@ def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, ca
     [
         (("--from-depth", "nowhere"), "no such folder"),
         (("--from-depth", "flat"), "no raw scans"),
+        (("--from-depth", "tree", "--out", "nowhere/rig.yaml"), "does not exist"),
         (("--from-depth", "tree", "--out", "rig.txt"), "ending in"),
         (("--from-depth", "tree", "--camera", "wide.yaml"), "its camera has"),
     ],
-    ids=["no tree", "no raw scans", "suffix", "camera"],
+    ids=["no tree", "no raw scans", "no folder", "suffix", "camera"],
 )
 def test_bad_input_is_a_message_status_2_and_no_file(tree, tmp_path, monkeypatch, capsys, options, message):
     make_tree(tmp_path / "flat")

@@ -22,10 +22,10 @@ def v5_bytes(compressed=True, **values):
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("dtype", ["f4", "f8", "i2", "u2", "i8"])
+@pytest.mark.parametrize("dtype", ["f4", "f8", "u1", "i2", "u2", "i4", "u4", "i8", "u8"])
 @pytest.mark.parametrize("compressed", [True, False])
 def test_v5_as_scipy_writes_it(tmp_path, dtype, compressed):
-    matrix = DEPTH.astype(dtype)
+    matrix = DEPTH.astype(dtype) if dtype not in ("u1",) else (DEPTH % 251).astype(dtype)
     file = tmp_path / "a.mat"
     file.write_bytes(v5_bytes(compressed, before=np.eye(3), depthMap=matrix, after="text"))
     read = read_matrix(file, "depthMap")
@@ -45,8 +45,10 @@ def test_v73_comes_out_as_matlab_shows_it_not_transposed(tmp_path, dtype):
     ("name", "variable"),
     [
         ("testdouble_6.1_SOL2.mat", "testdouble"),  # big-endian
+        ("testdouble_6.5.1_GLNX86.mat", "testdouble"),
         ("testdouble_7.4_GLNX86.mat", "testdouble"),  # compressed
         ("testmatrix_6.1_SOL2.mat", "testmatrix"),  # doubles that MATLAB stored as uint8
+        ("testmatrix_7.1_GLNX86.mat", "testmatrix"),
         ("testminus_7.4_GLNX86.mat", "testminus"),
         ("testmulti_7.1_GLNX86.mat", "a"),
         ("miutf8_array_name.mat", "array_name"),
@@ -76,7 +78,9 @@ def test_scipy_reads_what_is_written_and_equal_values_give_equal_bytes(tmp_path)
 
 REFUSED = {
     "another variable": (v5_bytes(other=DEPTH, third=DEPTH), "other, third"),
+    "another variable, v7.3": (v73_bytes(other=DEPTH), "other"),
     "complex": (v5_bytes(depthMap=DEPTH * 1j), "complex"),
+    "text": (v5_bytes(depthMap="deep"), "real numeric matrix"),
     "cell": (v5_bytes(depthMap=np.array([DEPTH, 1], dtype=object)), "real numeric matrix"),
     "three dimensions": (v5_bytes(depthMap=np.zeros((2, 3, 4))), "(2, 3, 4)"),
     "three dimensions, v7.3": (v73_bytes(depthMap=np.zeros((2, 3, 4))), "real numeric matrix"),
@@ -84,7 +88,9 @@ REFUSED = {
     "empty": (b"", "cut off"),
     "no variables": (v5_bytes(), "got none"),
     "cut off": (v5_bytes(depthMap=DEPTH)[:-9], "cut off"),
+    "cut off, not compressed": (v5_bytes(False, depthMap=DEPTH)[:-9], "cut off"),
     "cut off in its checksum": (v5_bytes(depthMap=DEPTH)[:-2], "cut off"),
+    "cut off after the matrix": (v5_bytes(depthMap=DEPTH, z="text")[:-9], "cut off"),
     "cut off, v7.3": (v73_bytes(depthMap=DEPTH)[:900], "v7.3"),
 }
 

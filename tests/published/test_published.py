@@ -186,8 +186,10 @@ BROKEN = {
     "object in two splits": (move_object, "train/fringe/mug_A0.png: object mug is in two splits"),
     "a view is missing": (remove_view, f"object power_drill lacks {STEM}"),
     "fringe without depth": (lambda t: depth_path(t).unlink(), f"{MAT}: is missing"),
+    "depth without fringe": (lambda t: fringe_path(t).unlink(), f"{PNG}: is missing"),
     "extra file": (lambda t: (t / RAW / "test/fringe/notes.txt").write_text("x"), "notes.txt: does not belong"),
     "extra folder": (lambda t: (t / RAW / "holdout").mkdir(), "holdout: does not belong"),
+    "extra folder in a split": (lambda t: (t / RAW / "test/normals").mkdir(), "normals: does not belong"),
     "no fringe folder": (lambda t: shutil.rmtree(t / RAW / "test/fringe"), "fringe: the folder is missing"),
     "a view that is none": (
         lambda t: move(fringe_path(t), fringe_path(t, stem="drill_A45")),
@@ -214,6 +216,14 @@ BROKEN = {
     "depth with a mark": (
         lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), 65535)),
         f"{MAT}: 79% of the pixels are exactly 65535, far from all depths: a value for background?",
+    ),
+    "depth in tenths of a mm": (
+        lambda t: mat(t, depthMap=np.uint16(10 * depth_of(STEM))),
+        "the file has another unit (times 0.1 it fits)",
+    ),
+    "depth with -1": (
+        lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), -1)),
+        f"{MAT}: 79% of the pixels are exactly -1",
     ),
     "depth in metres": (lambda t: mat(t, depthMap=depth_of(STEM) / 1000), f"{MAT}: depths of 1.7"),
 }
@@ -269,6 +279,11 @@ BROKEN_VARIANTS = {
         ("individual",),
         lambda t: info_path(t).unlink(),
         f"info_depth_params/test/depth/{MAT}: is missing",
+    ),
+    "range folder missing": (
+        ("individual",),
+        lambda t: shutil.rmtree(t / TRAINING / "info_depth_params"),
+        "info_depth_params: the folder is missing",
     ),
     "range of no sample": (
         ("individual",),
@@ -395,7 +410,7 @@ def test_bad_input_to_the_command_is_a_message_and_status_2(tmp_path, monkeypatc
     assert not (tmp_path / "out" / "manifest.json").exists()
 
 
-@pytest.mark.parametrize("mark", [65535, np.nan])
+@pytest.mark.parametrize("mark", [65535, -1, np.nan])
 def test_a_value_for_background_is_read_as_0(mark, tmp_path):
     plain, marked = make_tree(tmp_path / "plain"), make_tree(tmp_path / "marked")
     for file in (marked / RAW).rglob("*.mat"):

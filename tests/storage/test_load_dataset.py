@@ -9,7 +9,8 @@ import datasets
 import numpy as np
 import pyarrow as pa
 import pytest
-from conftest import TINY_CONFIGS, tiny_settings
+import torch
+from conftest import TINY_CONFIGS, TINY_SIZE, tiny_settings
 from synthetic import SyntheticRows, make
 
 import fpp_ml_bench
@@ -126,6 +127,8 @@ def test_usual_operations(tiny, opened, tmp_path):
         np.testing.assert_array_equal(row["frame_20"], opened.frame(row["sample"], 20))
     filtered = dataset.filter(lambda view: view == "A60", input_columns="view")
     assert filtered["sample"][:] == ["bowl_A60", "cork_A60"]
+    row = dataset.with_format("torch", columns=["frame_18", "depth"], dtype=torch.float32)[0]
+    assert row["frame_18"].dtype == torch.float32 and row["frame_18"].shape == (TINY_SIZE, TINY_SIZE)
     again = pickle.loads(pickle.dumps(dataset))
     np.testing.assert_array_equal(again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"]))
     assert verify(folder) == []  # verify ignores those caches

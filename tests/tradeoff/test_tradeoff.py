@@ -190,6 +190,8 @@ def test_all_methods_and_networks_of_the_size_are_measured(small, tmp_path, answ
     answers.variants |= {name: [{}] for name in shipped_names()} | {"other rigs": []}
     assert [point.method for point in planned(small.path, tmp_path).points][:2] == ["good", "bad"]
     assert [point.method for point in planned(small.path, tmp_path, ["other rigs"]).points] == ["other rigs"]
+    networks = measure._networks((224, 224))
+    assert "unet-individual-rmse" in networks and not measure._networks(small.size)
 
 
 def point(method, seconds, frames, error, **changes):
@@ -341,6 +343,9 @@ def test_files_hold_what_was_measured(small, tmp_path):
     (tmp_path / "broken.json").write_text(json.dumps(broken))
     with pytest.raises(SubmissionError, match=r"points\.0\.frames"):
         read_tradeoff(tmp_path / "broken.json")
+    (tmp_path / "broken.json").write_text(json.dumps(run.model_dump(mode="json") | {"image_size": [32]}))
+    with pytest.raises(SubmissionError, match="image_size"):
+        read_tradeoff(tmp_path / "broken.json")
 
 
 def test_the_command_measures(tiny, tmp_path, capsys, monkeypatch):
@@ -378,7 +383,8 @@ def test_refusals(small, tiny, tmp_path, capsys):
     assert main(["tradeoff", str(small.path), "--out", str(tmp_path / "file"), "--method", "constant"]) == 2
     assert main(["leaderboard", "--tradeoff", str(tmp_path / "file")]) == 2
     assert "--page" in capsys.readouterr().err
-    assert main(["tradeoff", str(tiny), "--clock", "sun"]) == 2
+    for words in (["--threads", "0"], ["--views", "0"], ["--clock", "sun"]):
+        assert main(["tradeoff", str(tiny), *words]) == 2
 
 
 @pytest.mark.processes
