@@ -47,8 +47,7 @@ def bent(sag_mm):
     return points
 
 
-@pytest.mark.parametrize("count", [3, 6])
-@pytest.mark.parametrize("noise_px", [0.0, 0.05, 0.4])
+@pytest.mark.parametrize(("count", "noise_px"), [(3, 0.0), (3, 0.4), (6, 0.05)])
 def test_a_right_calibration_is_not_doubted(count, noise_px):
     assert doubts(rigs.poses(BOARD.points_mm(), count, noise_px)) == ()
 
@@ -67,11 +66,8 @@ def test_an_irregular_board_and_panels_of_oblong_pixels_are_not_doubted():
         (shown(clean(), keystone(-0.04, 0.06)), {}, r"warning: the projector's pixels seem skewed .* explains \d\d%"),
         (shown(clean(), keystone(0.15, 0.2)), {"estimate_board": True}, "warning: the projector's pixels seem skewed"),
         (shown(clean(), keystone(0, 0.3)), {}, r"note: the projector's fx / fy is 1\.\d+, expected 0.99\d+ to 1.0"),
-        (shown(clean(), lambda _, p: p * [1, 0.9]), {}, r"note: the projector's fx / fy is 1\.11\d, expected 0\.99"),
-        (clean(BOARD.points_mm() * [1.01, 1, 1]), {}, r"columns seem farther apart than its rows by \+(1\.0|0\.9)\d%"),
         (clean(BOARD.points_mm() * [1, 1.02, 1]), {}, r"columns seem farther apart than its rows by -(1\.9|2\.0)\d%"),
         (clean(bent(1.5)), {}, r"warning: the board's ends seem bent by \+(2\.[01]|1\.9)\d% of half its side"),
-        (clean(bent(-0.6)), {}, r"warning: the board's ends seem bent by -0\.[789]\d% of half"),
         (clean(bent(1.5)), {"estimate_board": True}, None),
         (
             shown(clean(), lambda i, p: p + 3.0 * (i > 2)),

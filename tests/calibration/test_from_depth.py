@@ -112,9 +112,8 @@ def flat(tilt=0.0):
 
 def mirrored(side):
     v = view()
-    width = 912 / 24 if side == 0 else 1140 / 20
     periods = v.periods.copy()
-    periods[side] = width - periods[side]
+    periods[side] = (912 / 24, 1140 / 20)[side] - periods[side]
     return v._replace(periods=periods)
 
 
@@ -127,7 +126,6 @@ def scrambled():
 @pytest.mark.parametrize(
     ("views", "message"),
     [
-        ([view(depth_mm=flat())], "flat"),
         ([view(depth_mm=flat(0.5))], "flat"),
         ([view(depth_mm=flat(), noise=0.002)], "flat"),
         ([mirrored(0)], "mirrored"),
@@ -137,7 +135,7 @@ def scrambled():
         ([view(depth_mm=np.where(X < -0.95, surface_mm(), 0))], "at least 200 pixels"),
         ([view(centre=(-200.0, 569.5))], "outside the pattern"),
     ],
-    ids=["flat", "tilted", "noisy flat", "mirrored u", "mirrored v", "scrambled", "none", "few", "centre outside"],
+    ids=["tilted", "noisy flat", "mirrored u", "mirrored v", "scrambled", "none", "few", "centre outside"],
 )
 def test_what_does_not_determine_a_projector_is_refused(views, message):
     with pytest.raises(CalibrationError, match=message):
@@ -186,7 +184,7 @@ def test_pixels_without_phase_are_left_out():
     assert len(view_from_maps("v", KNOWN.camera, periods, depth_mm, most_px=500).depth_mm) <= 500
 
 
-@pytest.mark.parametrize(("vertical", "horizontal"), [(18.0, 18.0), (24.0, 20.0), (912 / 50, 19.0)])
+@pytest.mark.parametrize(("vertical", "horizontal"), [(18.0, 18.0), (912 / 50, 19.0)])
 def test_frames_give_periods_without_their_pitch(vertical, horizontal):
     """Patterns looked at directly: the camera sees projector pixels 1:1."""
     camera = Pinhole(912, 1140, 1824.0, 1824.0, 455.5, 569.5)

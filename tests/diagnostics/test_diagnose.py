@@ -142,11 +142,9 @@ def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tm
 @pytest.mark.parametrize(
     ("network", "units", "what"),
     [
-        ("silent", "normalised", "background"),
         ("silent", "mm", "background"),
         ("constant", "normalised", "0.5 of the depth range"),
         ("far", "m", "1800 mm"),
-        ("dead", "normalised", "0.5 of the depth range"),
         ("nearly_nothing", "normalised", "background"),
     ],
 )
@@ -176,7 +174,6 @@ def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tin
 @pytest.mark.parametrize(
     ("model", "options", "says"),
     [
-        ("unett", (), "unknown method 'unett'; there are classical"),
         ("MINE:make", ("--probe", "gradcam"), "--probe gradcam: did you mean 'grad-cam'"),
         ("MINE:make", ("--layers", "encodr"), "has no layer 'encodr'; there are encoder"),
         ("MINE:make", ("--layers", "unused", "--probe", "linear"), "'unused' takes no part in a forward pass"),
@@ -188,16 +185,12 @@ def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tin
         ("MINE:fails", (), "on fringes of shape (1, 1, 176, 176) it failed"),
         ("MINE:raises", (), "RuntimeError: no weights here"),
         ("MINE:number", (), "expected it to return a torch module, got int"),
-        ("FOLDER/absent.py:make", (), "no such file"),
-        ("FOLDER/broken.py:make", (), "importing it failed: ModuleNotFoundError"),
         ("classical", ("--layers", "enc1"), "has no layers"),
         ("phase", ("--units", "mm"), "its units are known"),
-        ("unet-individual-rmse", (), "was trained at 224x224 px"),
     ],
 )
 def test_what_cannot_be_looked_into_is_refused_with_a_reason(tiny, module_file, tmp_path, capsys, model, options, says):
-    (module_file.parent / "broken.py").write_text("import a_package_that_there_is_not\n")
-    model = model.replace("MINE", str(module_file)).replace("FOLDER", str(module_file.parent))
+    model = model.replace("MINE", str(module_file))
     assert call(model, tiny, "--out", tmp_path / "report", *options) == 2
     printed = capsys.readouterr().err
     assert says in printed and "Traceback" not in printed

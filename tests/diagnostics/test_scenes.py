@@ -120,8 +120,6 @@ def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, render
 
 
 def test_a_moved_plane_keeps_its_law():
-    from fpp_ml_bench.optics.named_rigs import paper_rig
-
     rig = paper_rig(176)
     surface = plane(rig, 1.8, (15.0, -10.0))
     still = moved(surface, rig, "vertical", lambda x, y: np.zeros_like(x))
@@ -178,11 +176,7 @@ def test_crossed_fringes_are_mirrored_and_widened():
 def test_another_outline_leaves_what_is_kept_as_it_was(renderer, sample_scene, scenes):
     frame = renderer.frames(sample_scene, [0])[0]
     outline_changes = of_kind(scenes, "outline")
-    assert [outline_change.name for outline_change in outline_changes] == [
-        "ellipse",
-        "another object's outline",
-        "grown",
-    ]
+    assert [change.name for change in outline_changes] == ["ellipse", "another object's outline", "grown"]
     for outline_change in outline_changes:
         unchanged = outline_change.scene.mask & sample_scene.mask
         assert unchanged.any() and (outline_change.name == "grown" or (outline_change.scene.mask == unchanged).all())

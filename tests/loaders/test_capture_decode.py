@@ -103,36 +103,12 @@ def written(folder, frames, tmp_path):
     return scan
 
 
-@pytest.mark.parametrize("pair", [(0, 2), (4, 7), (1, 5)])
-def test_frames_that_changed_places_are_named(capture, tmp_path, capsys, pair):
-    folder, row = capture
-    frames = list(row.frames.values())
-    frames[pair[0]], frames[pair[1]] = frames[pair[1]], frames[pair[0]]
-    assert decode(folder, written(folder, frames, tmp_path), tmp_path / "out") == 2
-    said = capsys.readouterr().err
-    titles = [load_rig(folder / "rig.yaml").sequence.frames[index].title for index in pair]
-    assert f"frames that changed places: {titles[0]} and {titles[1]}" in said
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["decode.json"]
-    report = json.loads((tmp_path / "out" / "decode.json").read_text())
-    assert report["examination"]["findings"][0]["severity"] == "refuse" and "pixels" not in report
-
-
 def test_saturated_frames_are_named(capture, tmp_path, capsys):
     folder, row = capture
     bright = [np.clip(frame.astype(float) * 2.5, 0, 255).astype(np.uint8) for frame in row.frames.values()]
     assert decode(folder, written(folder, bright, tmp_path), tmp_path / "out") == 0
     assert "saturated on lit pixels: frame_" in capsys.readouterr().err
     assert (np.load(tmp_path / "out" / "reason.npy") == Reason.SATURATED).any()
-
-
-def test_twelve_bits_decode_more_finely(capture, tmp_path):
-    folder, row = capture
-    deep = [(frame.astype(np.uint16) * 257 >> 4) for frame in row.frames.values()]
-    assert decode(folder, written(folder, deep, tmp_path), tmp_path / "out", "--bits", "12", "--forms", "npy") == 0
-    depth_mm = np.load(tmp_path / "out" / "depth.npy")
-    expected = decode_stack(list(row.frames.values()), load_rig(folder / "rig.yaml")).depth_mm
-    both = (depth_mm > 0) & (expected > 0)
-    assert both.sum() > 0.98 * (expected > 0).sum() and np.abs(depth_mm - expected)[both].max() < 1
 
 
 def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
@@ -146,6 +122,8 @@ def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
     assert decode(folder, scan, tmp_path / "out") == 2
     assert "frame_2.png and frame_3.png show the same image" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["decode.json"]  # of the refused capture
+    refused = json.loads((tmp_path / "out" / "decode.json").read_text())
+    assert refused["examination"]["findings"][0]["severity"] == "refuse" and "pixels" not in refused
     assert decode(folder, scan, tmp_path / "out", "--anyway", "--forms", "npy") == 0
     assert "warning: equal frames" in capsys.readouterr().err
     report = json.loads((tmp_path / "out" / "decode.json").read_text())
@@ -170,8 +148,7 @@ def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(ca
     assert {"decode.json", "depth.mat"} <= names and not {"depth.npy", ".0123456789abcdef.tmp"} & names
 
 
-@pytest.mark.parametrize("gamma", [1.0, 1.5, 2.2])
-@pytest.mark.parametrize("steps", [3, 4, 6])
+@pytest.mark.parametrize(("steps", "gamma"), [(3, 2.2), (4, 1.5), (6, 1.0)])
 def test_the_stated_uncertainty_holds_the_error_of_gamma(steps, gamma):
     rig = vertical_rig({"scheme": "phase-shift", "pitch_px": 57, "steps": steps, "gray": {}})
     x, y = rig.camera.rays()
@@ -192,14 +169,11 @@ def test_the_stated_uncertainty_holds_the_error_of_gamma(steps, gamma):
     "words, said",
     [
         (["--working-range", "1,2"], "1 to 2 mm, where no rig looks"),
-        (["--min-modulation", "200"], "too faint"),
-        (["--min-modulation", "0"], "min_modulation: expected a positive"),
         (["--direction", "horizontal"], "no horizontal"),
         (["--forms", "obj"], "expected some of npy, mat"),
-        (["--threads", "0"], "--threads 0"),
         (["--mask", "none.npy"], "none.npy"),
-        (["--noise", "-1"], "noise_grey: expected grey levels above 0"),
         (["--bits", "12"], "expected levels of 12 bits"),
+        (["--noise", "-1"], "noise_grey: expected grey levels above 0"),
     ],
 )
 def test_bad_words_are_a_sentence_and_nothing_is_written(capture, tmp_path, capsys, words, said):
@@ -214,8 +188,6 @@ def test_bad_words_are_a_sentence_and_nothing_is_written(capture, tmp_path, caps
     [
         (lambda frames: frames[:-1], "expected 14 frames, found 13"),
         (lambda frames: [frame[:, :100] for frame in frames], "camera of 120 x 120"),
-        (lambda frames: [frames[0][:50], *frames[1:]], "120 x 50"),
-        (lambda frames: [], "expected a folder with images"),
         (lambda frames: [np.zeros_like(frame) for frame in frames], "too faint"),
     ],
 )
@@ -245,18 +217,9 @@ def test_patterns_come_with_a_manifest(tmp_path, capsys):
     assert "is not empty; give a new folder, so that no old pattern" in capsys.readouterr().err
 
 
-def test_a_killed_writing_of_patterns_leaves_none_and_a_second_one_is_told(tmp_path, capsys, monkeypatch):
-    words = ["patterns", "paper", "--out", str(tmp_path / "images")]
-
-    def killed(*contents):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr("fpp_ml_bench.cli.patterns.write_files", killed)
-        assert main(words) == 130
-    assert not (tmp_path / "images").exists()
+def test_of_two_that_write_patterns_one_is_told(tmp_path, capsys):
     with whole_folder(tmp_path / "images", "here", CaptureError):
-        assert main(words) == 2
+        assert main(["patterns", "paper", "--out", str(tmp_path / "images")]) == 2
     assert "another process is writing patterns there" in capsys.readouterr().err
 
 
@@ -271,7 +234,6 @@ def test_of_two_that_decode_into_a_folder_one_is_told(capture, tmp_path, capsys)
 @pytest.mark.parametrize(
     "text, said",
     [
-        ("", "empty"),
         ("sequence: {}", "projector: expected a mapping"),
         ("projector: {width: 20}", "projector.height: missing"),
         ("projector: {width: 20, height: 20}", "pitch_px: missing"),
@@ -285,18 +247,3 @@ def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text,
     (tmp_path / "projector.yaml").write_text(text)
     assert main(["patterns", str(tmp_path / "projector.yaml"), "--out", str(tmp_path / "images")]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "images").exists()
-
-
-def test_a_rig_file_may_name_a_calibration_by_opencv(tmp_path):
-    from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, read_opencv_calibration, write_opencv_calibration
-
-    rig = vertical_rig({"scheme": "gray", "cell_px": 2})
-    write_opencv_calibration(
-        OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m), tmp_path / "c.yml"
-    )
-    assert read_opencv_calibration(tmp_path / "c.yml").camera == rig.camera
-    (tmp_path / "rig.yaml").write_text(
-        "calibration: c.yml\nworking_range_mm: [1500, 2100]\nbackground_m: 3.2\nstandoff_m: 1.8\n"
-        "sequence: {order: [vertical, white, black], vertical: {scheme: gray, cell_px: 2}}\n"
-    )
-    assert load_rig(tmp_path / "rig.yaml") == rig

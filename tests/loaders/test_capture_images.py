@@ -1,8 +1,6 @@
 """Captured images: what is read, in which order and scale, and what is refused."""
 
 import io
-import struct
-from zlib import crc32
 
 import cv2
 import numpy as np
@@ -61,72 +59,41 @@ def test_natural_order(tmp_path):
     assert [file.name for file in frame_files(tmp_path)] == names
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize(
     ("stored", "bits", "full_scale", "note"),
     [
         (DEEP, None, 65535, "no level is above 65535: taken as 16 bits"),
         (DEEP >> 4, None, 4095, "no level is above 4095: taken as 12 bits"),
-        (DEEP >> 6, None, 1023, "no level is above 1023: taken as 10 bits"),
         (DEEP >> 4 << 4, None, 65520, "all levels are multiples of 16: taken as 12 bits, shifted up by 4"),
-        (DEEP >> 2 << 2, None, 65532, "all levels are multiples of 4: taken as 14 bits, shifted up by 2"),
         (DEEP >> 4, 12, 4095, ""),
         (DEEP >> 4 << 4, 12, 65520, ""),
         (DEEP >> 8, 12, 4095, ""),
-        (DEEP >> 8, 16, 65535, ""),
         (DEEP >> 8, 8, 255, ""),
         (DEEP * 0, None, 255, "no level is above 255: taken as 8 bits"),
     ],
 )
-def test_more_than_eight_bits(tmp_path, stored, bits, full_scale, note, suffix):
-    put(tmp_path, *stored, suffix=suffix)
+def test_more_than_eight_bits(tmp_path, stored, bits, full_scale, note):
+    put(tmp_path, *stored)
     read = read_frames(tmp_path, bits=bits)
     assert read.frames.dtype == np.float32 and (read.full_scale, read.note) == (full_scale, note)
     np.testing.assert_allclose(read.frames, stored * (255 / full_scale), rtol=1e-7)
-
-
-def _turned(image, suffix, orientation):
-    """A PNG with the chunk eXIf, or a TIFF, that asks for ``orientation``; in colour as OpenCV writes it."""
-    content = _bytes(image, suffix)
-    tag = struct.pack("<HHIHH", 274, 3, 1, orientation, 0)
-    if suffix == ".png":
-        chunk = b"eXIfII*\0" + struct.pack("<IH", 8, 1) + tag + bytes(4)
-        return content[:33] + struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", crc32(chunk)) + content[33:]
-    (start,) = struct.unpack_from("<I", content, 4)
-    (count,) = struct.unpack_from("<H", content, start)
-    tags = [content[place : place + 12] for place in range(start + 2, start + 2 + 12 * count, 12)]
-    tags = sorted([tag, *(t for t in tags if t[:2] != tag[:2])], key=lambda t: struct.unpack_from("<H", t))
-    padded = content + bytes(len(content) % 2)
-    return (
-        padded[:4]
-        + struct.pack("<I", len(padded))
-        + padded[8:]
-        + struct.pack("<H", len(tags))
-        + b"".join(tags)
-        + bytes(4)
-    )
+    assert (read.frames[stored == full_scale] == 255).all()
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_images_are_upright_by_their_orientation(tmp_path, orientation, dtype, channels):
-    image = RNG.integers(0, 256, (30, 41, channels), np.uint8).squeeze().astype(dtype)
-    marked = Image.fromarray((image if channels == 1 else image[..., 1]).astype(np.uint8))
-    marked.getexif()[274] = orientation
-    upright = np.asarray(ImageOps.exif_transpose(marked))
-    if orientation in (3, 6):  # by definition
-        assert np.array_equal(upright, np.rot90(np.asarray(marked), 2 if orientation == 3 else -1))
-    for suffix in (".png", ".tif"):
-        file = tmp_path / f"a{suffix}"
-        file.write_bytes(_turned(image, suffix, orientation))
-        read = read_frames(file, colour="green", bits=8)
-        assert read.full_scale == 255 and np.array_equal(read.frames[0], upright)
-
-
-def test_white_is_exactly_255(tmp_path):
-    put(tmp_path, np.full((4, 4), 4095, np.uint16), np.full((4, 4), 1, np.uint16))
-    assert (read_frames(tmp_path, bits=12).frames[0] == 255).all()
+def test_images_are_upright_by_their_orientation(tmp_path, orientation):
+    for number, image in enumerate((GREY[0], COLOUR, DEEP[0])):
+        marked = Image.fromarray(image)
+        marked.getexif()[274] = orientation
+        upright = np.asarray(ImageOps.exif_transpose(marked))
+        if orientation in (3, 6):  # by definition
+            assert np.array_equal(upright, np.rot90(image, 2 if orientation == 3 else -1))
+        for suffix in (".png", ".tif"):
+            file = tmp_path / f"{number}{suffix}"
+            marked.save(file, exif=marked.getexif())
+            read = read_frames(file, colour="green").frames[0]
+            expected = upright[..., 1] if image is COLOUR else upright * (255 / np.iinfo(image.dtype).max)
+            np.testing.assert_allclose(read, expected, rtol=1e-7)
 
 
 def test_equal_channels_and_opaque_alpha_are_grey(tmp_path):
@@ -139,9 +106,8 @@ def test_equal_channels_and_opaque_alpha_are_grey(tmp_path):
     np.testing.assert_allclose(read_frames(tmp_path / "deep_*").frames, DEEP * (255 / 65535), rtol=1e-7)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif"])
-def test_colour_is_turned_to_grey_where_it_is_said_how(tmp_path, suffix):
-    put(tmp_path, COLOUR, suffix=suffix)
+def test_colour_is_turned_to_grey_where_it_is_said_how(tmp_path):
+    put(tmp_path, COLOUR)
     for channel, colour in enumerate(("blue", "green", "red")):
         read = read_frames(tmp_path, colour=colour).frames
         assert read.dtype == np.uint8 and np.array_equal(read[0], COLOUR[..., channel])
@@ -184,12 +150,10 @@ PALETTE.info["transparency"] = 3
     [
         ("a.png", b"", "found a file of 0 bytes"),
         ("a.png", b"no image at all", "expected a PNG, BMP or TIFF image.*of another form"),
-        ("a.png", PNG[: len(PNG) // 2], "the PNG is cut off"),
         ("a.png", PNG[:-12], "the PNG is cut off"),
         ("a.png", PNG[:-1], "the PNG is cut off"),
         ("a.png", PNG[:20], "cut off, damaged"),
         ("a.png", _flipped(PNG, len(PNG) // 2), "the PNG is damaged, a checksum"),
-        ("a.bmp", BMP[: len(BMP) // 2], "the BMP is cut off"),
         ("a.bmp", BMP[:-1], f"the BMP is cut off: expected {len(BMP)} bytes, found {len(BMP) - 1}"),
         ("a.tif", TIF[: len(TIF) // 2], "cut off, damaged"),
         ("a.tif", _saved(PIL, "TIFF")[:-40], "cut off, damaged"),
@@ -198,12 +162,10 @@ PALETTE.info["transparency"] = 3
         ("a.png", _bytes(GREY[0], ".jpg"), "compressed with loss"),
         ("a.webp", b"RIFF", "found a .webp file; convert it without loss"),
         ("a.png", _bytes(COLOUR), "the colour channels differ; say which to take by colour .luminance, red"),
-        ("a.bmp", _bytes(COLOUR, ".bmp"), "the colour channels differ"),
         ("a.png", _bytes(CLEAR), "transparent pixels"),
         ("a.png", _bytes(CLEAR.astype(np.uint16) * 257), "transparent pixels"),
         ("a.png", _saved(PALETTE, "PNG"), "transparent pixels"),
         ("a.png", _saved(PIL.convert("1"), "PNG"), "8 to 16 bits, found mode 1 of 1 bits"),
-        ("a.bmp", _saved(PIL.convert("1"), "BMP"), "8 to 16 bits, found mode 1 of 1 bits"),
         ("a.tif", _saved(PIL.convert("F"), "TIFF"), "found mode F of 32 bits"),
         ("a.tif", _saved(PIL.convert("CMYK"), "TIFF"), "found mode CMYK"),
         ("a.tif", _saved(PIL, "TIFF", save_all=True, append_images=[PIL]), "expected one image, found 2"),

@@ -133,26 +133,6 @@ def test_captures_become_a_dataset_like_any_other(scanned, capsys):
     assert importing(scanned, "--splits", scanned / "splits.yaml") == 0  # finished: nothing is done again
 
 
-def test_a_generated_set_exported_as_frames_is_imported_to_its_own_ground_truth(tmp_path):
-    """The builder's frames of a rig with one direction, as PNG files: the same depth where it was decoded there."""
-    rig = rig_from_dict({**coded_rig(96, 96, vertical=UNIT_CUE).to_dict(), "background_m": 3.2})
-    save_rig(rig, tmp_path / "rig.yaml")
-    assert (
-        run("build", "--out", tmp_path / "made", "--rig", tmp_path / "rig.yaml", "--objects", "mug", "--workers", 1)
-        == 0
-    )
-    made = DatasetFolder(tmp_path / "made")
-    for sample in made.samples("all"):
-        view = made.measured(sample)["view"]
-        write(tmp_path / "scans" / "mug" / view, made.frames(sample, range(6)))
-    assert importing(tmp_path, "--workers", 2) == 0
-    opened = DatasetFolder(tmp_path / "set")
-    assert opened.samples("test") == made.samples("all")  # A60 before A120
-    for sample in opened.samples("test"):
-        there = made.depth_mm(sample) > 0
-        np.testing.assert_array_equal(opened.depth_mm(sample)[there], made.depth_mm(sample)[there])
-
-
 def test_deeper_images_are_decoded_as_captured_and_stored_in_eight_bits(scanned, capsys):
     shutil.rmtree(scanned / "scans")
     deep = [np.rint(frame * 16 + 7.0) for frame in frames_of(RIG, 0)]
@@ -172,14 +152,10 @@ def test_deeper_images_are_decoded_as_captured_and_stored_in_eight_bits(scanned,
     [
         ({"order": ["black", "white", "vertical"], "vertical": {"scheme": "gray", "cell_px": 2}}, 11),
         ({"horizontal": UNIT_CUE | {"pitches_px": [57, 1140]}, "vertical": UNIT_CUE}, 12),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 57, "steps": 4, "gray": {}}}, 9),
-        ({"steps": 3, "bits_horizontal": 7, "bits_vertical": 7}, 20),
     ],
 )
 def test_any_sequence_and_limits(tmp_path, sequence, used):
-    rig = coded_rig(**sequence) if "steps" not in sequence else None
-    if rig is None:  # the paper's kind: both directions, black and white
-        rig = rig_from_dict({**paper_rig(90).to_dict(), "sequence": sequence})
+    rig = coded_rig(**sequence)
     write(tmp_path / "scans" / "part", frames_of(rig, 0))
     save_rig(rig, tmp_path / "rig.yaml")
     assert importing(tmp_path, "--min-modulation", 8, "--max-clipped-steps", 0) == 0
@@ -190,8 +166,6 @@ def test_any_sequence_and_limits(tmp_path, sequence, used):
     assert np.median(np.abs(depth_mm - 1000 * depth_m(rig, 0))[seen]) < 10  # cells of two pixels are the coarsest
     assert run("predict", "classical", tmp_path / "set", "--out", tmp_path / "p") == 0
     assert len(yaml.safe_load((tmp_path / "p" / "submission.yaml").read_text())["frames_used"]) == used
-    assert run("info", tmp_path / "set") == 0
-    assert run("show", tmp_path / "set", "part_single", "--out", tmp_path / "a.png") == 0
 
 
 def test_an_interrupted_import_goes_on_and_gives_the_same_bytes(scanned, monkeypatch):
@@ -299,32 +273,15 @@ def copy_frame(to):
     return lambda folder: shutil.copy(folder / "scans" / "bolt" / "frame_0.png", folder / "scans" / to)
 
 
-def other_size(folder):
-    cv2.imwrite(str(folder / "scans" / "bolt" / "frame_6.png"), np.zeros((70, 91)))
-
-
 def rename(old, new):
     return lambda folder: (folder / "scans" / old).rename(folder / "scans" / new)
 
 
-def jpeg(folder):
-    frame = folder / "scans" / "bolt" / "frame_3.png"
-    cv2.imwrite(str(frame.with_suffix(".jpg")), cv2.imread(str(frame)))
-    frame.unlink()
-
-
-SEVEN = {"order": ["white", "vertical"], "vertical": UNIT_CUE | {"steps": [3, 4]}}
 BAD = {
     "missing frame": (changed(lambda f: (f / "scans/bolt/frame_6.png").unlink()), "expected the 7 frames.*found 6"),
-    "one frame more": (changed(copy_frame("bolt/x.png")), "found 8"),
-    "another sequence": (of_rig(sequence=SEVEN), "expected the 8 frames.*found 7"),
     "unreadable image": (of_many, r"(?s)bolt/frame_3\.png.*\n.*front/frame_2\.png"),
-    "lossy image": (changed(jpeg), r"frame_3\.jpg.*JPEG"),
-    "frames of two sizes": (changed(other_size), "91 x 70 px"),
     "another size": (of_frames(lambda image: image[:60]), "bolt: frames of 90 x 60 px, .*camera of 90 x 70 px"),
-    "colour": (of_frames(lambda image: np.stack([image, image // 2, image], -1)), "colour channels differ"),
     "empty object": (changed(in_scans("empty")), "empty: expected a folder with images"),
-    "empty view": (changed(in_scans("gear_wheel/top")), "top: expected a folder with images"),
     "nothing": (changed(lambda f: [shutil.rmtree(f / "scans"), (f / "scans").mkdir()]), "holds no folder of an object"),
     "no folder": (changed(lambda f: shutil.rmtree(f / "scans")), "expected a folder with a folder of frames for each"),
     "frames beside objects": (changed(copy_frame(".")), "holds frames itself"),
@@ -338,23 +295,19 @@ BAD = {
     "unknown split": (splits("{tests: [bolt, gear_wheel]}"), "tests: is not a key"),
     "splits that are no list": (splits("{test: bolt}"), "test: .*list"),
     "malformed splits": (splits("{test: ["), "is no plain YAML"),
-    "no splits file": (lambda f: ("--splits", f / "none.yaml"), "none.yaml: can't be read"),
     "dark": (of_frames(lambda image: image // 40), "refused as low modulation: probably the fringes are too faint"),
     "overexposed": (of_frames(lambda image: np.minimum(image.astype(int) * 5 + 170, 255)), "refused as .*: probably"),
     "another range": (of_rig(working_range_mm=[900, 1000], standoff_m=0.95), "nothing in the range: .*another working"),
-    "impossible bits": (lambda f: ("--bits", 20), "bits: expected a whole number from 8 to 16"),
-    "bits of deeper images": (lambda f: ("--bits", 12), "found images of 8 bits"),
     "unknown colour": (lambda f: ("--colour", "cyan"), "colour: expected luminance"),
     "impossible limit": (lambda f: ("--min-modulation", -1), "min_modulation: expected a positive"),
     "frame order": (lambda f: ("--frame-order", "paper"), "belongs to published trees"),
-    "no workers": (lambda f: ("--workers", 0), "expected 1 or more"),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_no_capture_is_refused(scanned, name, capsys):
     prepare, said = BAD[name]
-    assert importing(scanned, *prepare(scanned), *([] if name == "no workers" else ["--workers", 1])) == 2
+    assert importing(scanned, *prepare(scanned), "--workers", 1) == 2
     error = capsys.readouterr().err
     assert re.search(said, error), error
     assert "Traceback" not in error and not (scanned / "set" / "manifest.json").exists()
@@ -365,20 +318,15 @@ def test_options_belong_to_one_kind_of_import(scanned, capsys):
     assert "give its file with --rig" in capsys.readouterr().err
     assert run("import", scanned / "scans", "--out", scanned / "set", "--bits", 12) == 2
     assert "--bits belongs to captures" in capsys.readouterr().err
-    assert (
-        run("import", scanned / "scans", "--out", scanned / "set") == 2
-    )  # the published layout stays as strict as it is
 
 
 @pytest.mark.parametrize(
     ("method", "said"),
     [
         (["classical", "--steps", "3"], "leave steps out"),
-        (["classical", "--direction", "horizontal"], "no horizontal fringes or codes, only vertical"),
         (["classical", "--fewest"], "leave fewest out"),
         (["phase", "--direction", "horizontal"], "vertical fringes, and no horizontal ones"),
         (["unet-individual-rmse"], "was trained at 224x224 px"),
-        (["phase-net", "--direction", "horizontal"], "vertical fringes, and no horizontal ones"),
     ],
 )
 def test_methods_that_can_not_run_say_what_they_need(scanned, method, said, capsys):

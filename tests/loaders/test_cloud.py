@@ -86,11 +86,7 @@ def test_files_are_read_back(tmp_path):
     ("depth_mm", "grey", "said"),
     [
         (DEPTH_MM * 0, GREY, "all pixels are background .* no point to write"),
-        (DEPTH_MM * np.nan, GREY, "expected finite numbers"),
-        (-DEPTH_MM, GREY, "expected finite numbers"),
-        (DEPTH_MM[:-1], GREY, "expected real numbers of shape"),
         (DEPTH_MM, GREY[:-1], "grey: expected real numbers of shape"),
-        (DEPTH_MM, GREY * np.nan, "grey: expected finite numbers from 0 to 255"),
     ],
 )
 def test_refused_maps(tmp_path, depth_mm, grey, said):
@@ -103,9 +99,7 @@ def test_refused_maps(tmp_path, depth_mm, grey, said):
     ("points_mm", "grey", "said"),
     [
         (np.zeros((0, 3)), np.zeros(0, np.uint8), "N > 0"),
-        (np.zeros((4, 2)), np.zeros(4, np.uint8), "shape"),
         (np.full((4, 3), np.inf), np.zeros(4, np.uint8), "finite"),
-        (np.zeros((4, 3)), np.zeros(3, np.uint8), "grey"),
         (np.zeros((4, 3)), np.zeros(4), "uint8"),
     ],
 )
@@ -114,21 +108,14 @@ def test_refused_points(points_mm, grey, said):
         cloud_html("none", points_mm, grey)
 
 
-def test_a_folder_that_can_not_be_written(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CaptureError, match="can't be written"):
-        write_cloud(tmp_path / "file", "bowl", "A bowl", RIG, DEPTH_MM, GREY)
-
-
-def test_command(tmp_path, capsys):
-    data, picture = tmp_path / "data", tmp_path / "pictures" / "pen.png"
-    assert main(["build", "--out", str(data), "--objects", "pen", "--size", "176", "--config", "single_shot"]) == 0
-    assert main(["show", str(data), "pen_A0", "--out", str(picture), "--cloud"]) == 0
+def test_command(tiny, tmp_path, capsys):
+    picture = tmp_path / "pictures" / "mug.png"
+    assert main(["show", str(tiny), "mug_A0", "--out", str(picture), "--cloud"]) == 0
     names = [picture, picture.with_suffix(".ply"), picture.with_suffix(".html")]
     assert capsys.readouterr().out.splitlines()[-3:] == [str(name) for name in names]
-    assert all(name.is_file() for name in names) and "pen_A0: exact depth" in names[2].read_text()
+    assert all(name.is_file() for name in names) and "mug_A0: exact depth" in names[2].read_text()
     assert len(trimesh.load(names[1]).vertices) == len(held(names[2].read_bytes())["places"]) > 50
-    assert main(["show", str(data), "--sheet", "--cloud"]) == 2
+    assert main(["show", str(tiny), "--sheet", "--cloud"]) == 2
     assert "expected a SAMPLE" in capsys.readouterr().err
 
 
@@ -150,10 +137,10 @@ def _drawn(pixels: np.ndarray) -> np.ndarray:
     return (np.abs(pixels - pixels[0, 0]) > 8).any(axis=-1)
 
 
-@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True)])
-def test_page_in_a_browser(browser, tmp_path, width, dark):
+def test_page_in_a_browser(browser, tmp_path):
+    width = 390
     (page := tmp_path / "bowl.html").write_bytes(cloud_html(HOSTILE, POINTS_MM, GREY[THERE]))
-    browser.open(page, width, 844, dark)
+    browser.open(page, width, 844, dark=True)
     assert browser.run("document.documentElement.scrollWidth") <= width
     assert browser.run("document.getElementById('without').hidden") is True
     first = _pixels(browser)

@@ -9,7 +9,7 @@ from huggingface_hub import HfApi
 
 from fpp_ml_bench.errors import FppBenchError, RemoteError
 from fpp_ml_bench.loaders import hub as hub_module
-from fpp_ml_bench.loaders.hub import Hub, Unreachable, _answer
+from fpp_ml_bench.loaders.hub import Hub, Unreachable
 
 
 def served(content, drip=False):
@@ -76,9 +76,3 @@ def test_redirects_without_end_are_a_message(monkeypatch):
     monkeypatch.setattr(socket, "create_server", lambda address: real(("127.0.0.1", port)))
     with closing(served(f"{head}\r\n\r\n".encode())) as server, pytest.raises(RemoteError):
         hub_at(server, monkeypatch, sending=False).state("dataset", "some/data")
-
-
-def test_an_answer_and_an_error_come_back_as_they_are():
-    assert _answer(lambda: 3) == 3
-    with pytest.raises(KeyError, match="x"):
-        _answer(lambda: {}["x"])

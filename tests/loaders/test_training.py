@@ -5,12 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import TINY_CONFIGS, tiny_settings
+from conftest import TINY_CONFIGS
+from synthetic import make
 from torch.utils.data import DataLoader
 
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.render.builder import build, plan_build
+from fpp_ml_bench.loaders.render.builder import plan_build
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.training import FringeDepthDataset, unit_range
 from fpp_ml_bench.optics.named_rigs import paper_rig
@@ -59,8 +60,7 @@ def test_pairs_are_all_frames_of_a_row_then_the_next(tiny, config):
 
 
 @pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
-@pytest.mark.parametrize("background_removed", [False, True])
-@pytest.mark.parametrize("rule", ["object", "valid"])
+@pytest.mark.parametrize(("background_removed", "rule"), [(False, "object"), (True, "valid")])
 def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed, rule):
     """By the rule ``valid`` the range is that of the pixels that are not void; depths beyond it are cut to it."""
     dataset = FringeDepthDataset(tiny, "test", "vertical", normalisation, background_removed, rule)
@@ -92,12 +92,6 @@ def test_grey_levels_become_the_unit_range():
     unit_range(grey, out)
     np.testing.assert_allclose(out, grey.astype(np.float64) / 255, rtol=2**-23)
     assert out[0, 0] == 0 and out[15, 15] == 1
-
-
-def test_background_is_there_unless_removed(tiny, opened):
-    with_background = FringeDepthDataset(tiny, "validation")[0].fringe[0].numpy()
-    depth = opened.depth_mm(opened.splits["validation"][0])
-    assert (with_background[depth == 0] > 0).mean() > 0.5
 
 
 def test_flat_sample_is_zero_throughout(tiny, monkeypatch):
@@ -147,12 +141,9 @@ def test_items_own_their_memory(tiny):
     assert dataset[0].depth.max() == 1  # the file is untouched
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_data_loader_gives_the_same_batches_from_a_spawned_worker(tiny, workers):
+def test_data_loader_gives_the_same_batches_from_a_spawned_worker(tiny):
     dataset = FringeDepthDataset(tiny, "validation", "single_shot", "individual", True)
-    loader = DataLoader(
-        dataset, batch_size=4, num_workers=workers, multiprocessing_context="spawn" if workers else None
-    )
+    loader = DataLoader(dataset, batch_size=4, num_workers=1, multiprocessing_context="spawn")
     batches = list(loader)
     assert [len(b.row) for b in batches] == [4, 2]
     assert batches[0].fringe.shape == (4, 1, *dataset.source.size)
@@ -161,6 +152,11 @@ def test_data_loader_gives_the_same_batches_from_a_spawned_worker(tiny, workers)
         assert int(batch.row[place]) == index
         assert torch.equal(batch.depth[place], dataset[index].depth)
         assert torch.equal(batch.fringe[place], dataset[index].fringe)
+
+
+def test_configuration_that_is_not_stored(tmp_path):
+    with pytest.raises(DatasetError, match="no configuration 'all'; there are single_shot"):
+        FringeDepthDataset(make(tmp_path / "set"), "train", "all")
 
 
 @pytest.mark.parametrize(
@@ -174,10 +170,3 @@ def test_data_loader_gives_the_same_batches_from_a_spawned_worker(tiny, workers)
 def test_errors(tiny, options, says):
     with pytest.raises(DatasetError, match=says):
         FringeDepthDataset(**{"folder": tiny, "split": "train", **options})
-
-
-def test_configuration_that_is_not_stored(tmp_path):
-    build(tmp_path / "set", tiny_settings(objects=("cork",), stored="single_shot"), workers=1)
-    assert len(FringeDepthDataset(tmp_path / "set", "train")) == 6
-    with pytest.raises(DatasetError, match="no configuration 'all'; there are single_shot"):
-        FringeDepthDataset(tmp_path / "set", "train", "all")

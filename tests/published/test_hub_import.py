@@ -158,15 +158,12 @@ REFUSALS = {
     "unknown": (["somebody/nothing"], "no such folder here, and no such dataset on http"),
     "private": (["somebody/private"], "no such dataset on http"),
     "gated": (["gated/data"], "accept the conditions"),
-    "fault": (["broken/data"], r"fault \(500\)"),
     "no layout": (["somebody/else"], "does not have the published layout; expected training_datasets/ with one of"),
     "parquet": (["somebody/parquet"], 'Parquet files, which datasets.load_dataset("somebody/parquet") opens'),
     "no revision": ([NAME, "--revision", "v9\x1b"], r"has no branch, tag or commit 'v9\\x1b'"),
     "no raw scans": ([NAME, "--raw-scans"], "has no raw scans"),
-    "no raw scans for a rig": ([NAME, "--fit-rig"], "has no raw scans"),
     "revision of a folder": (["tree", "--revision", "v1"], "--revision belongs to a dataset of the Hub"),
     "raw scans of a folder": (["tree", "--raw-scans"], "--raw-scans belongs to a dataset of the Hub"),
-    "captures": ([NAME, "--captures", "--raw-scans"], "--raw-scans belongs to a dataset of the Hub"),
     "not a name": (["a/b/c"], "or OWNER/NAME of a dataset on the Hugging Face Hub"),
 }
 
@@ -191,11 +188,6 @@ def refused(run, words, message):
     assert message.replace("\\", "") in sentence.replace("\\", ""), sentence
 
 
-def test_no_network(run, monkeypatch):
-    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
-    refused(run, [NAME], "http://127.0.0.1:9 can't be reached")
-
-
 def test_offline(run, monkeypatch):
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     refused(run, [NAME], "HF_HUB_OFFLINE is set, so nothing may be downloaded; unset it")
@@ -208,8 +200,8 @@ def test_a_disk_that_is_too_small(run, monkeypatch):
     assert run.downloaded == set()
 
 
-@pytest.mark.parametrize("name", [NAME, "somebody/else"])
-def test_opening_a_name_of_the_hub_says_how_to_fetch_it(run, name):
+def test_opening_a_name_of_the_hub_says_how_to_fetch_it(run):
+    name = "somebody/else"
     message = (
         f"{name}: is no dataset folder; to fetch the published dataset: fpp-bench import {name} --out data/published"
     )
@@ -222,13 +214,14 @@ def test_opening_a_name_of_the_hub_says_how_to_fetch_it(run, name):
     assert run.server.requests == []
 
 
-@pytest.mark.parametrize("name", ["data/mini", "sets/mini", "mini", "./a/b/c", "/tmp/none"])
+@pytest.mark.parametrize("name", ["data/mini", "sets/mini", "mini"])
 def test_opening_a_folder_that_is_not_there_says_how_to_build_it(run, name, tmp_path):
     (tmp_path / "sets").mkdir()
     with pytest.raises(DatasetError, match="no such folder; build one with: fpp-bench build"):
         fpp_ml_bench.load_dataset(name)
 
 
+@pytest.mark.processes
 def test_help_does_not_wait_for_the_client():
     code = (
         "import sys\nfrom fpp_ml_bench.cli import main\nassert main(['import', '--help']) == 0\n"

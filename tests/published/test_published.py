@@ -3,13 +3,11 @@
 import os
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 import scipy.io
 from published_trees import (
     FOLDERS,
-    SPLITS,
     TRAINING,
     VIEWS,
     command,
@@ -26,7 +24,7 @@ from published_trees import (
 )
 
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
-from fpp_ml_bench.loaders.published.importing import plan_import
+from fpp_ml_bench.loaders.published.importing import import_notes, plan_import
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig_file import save_rig
@@ -78,6 +76,7 @@ def test_the_individual_variant_alone_loses_only_the_pixels_at_least_depth(tmp_p
         expected = depth_of(sample)
         expected[expected == expected[expected > 0].min()] = 0
         assert np.array_equal(dataset.depth_mm(sample), expected)
+    assert any("became background" in note for note in import_notes(dataset.manifest))
 
 
 def test_variants_beside_each_other_are_checked_against_raw(tmp_path):
@@ -196,36 +195,31 @@ BROKEN = {
         lambda t: move(fringe_path(t), fringe_path(t, stem="drill_A45")),
         "drill_A45.png: expected",
     ),
-    "a name without view": (lambda t: write_png(fringe_path(t, stem="drill"), fringe_of("a")), "drill.png: expected"),
     "a link to nowhere": (lambda t: link_to_nowhere(fringe_path(t)), PNG),
     "png cut off": (lambda t: cut(fringe_path(t)), f"{PNG}: the PNG is cut off"),
     "png damaged": (lambda t: flip(fringe_path(t), 200), f"{PNG}: the PNG is damaged"),
     "no png at all": (lambda t: fringe_path(t).write_bytes(b"P5 24 24 255 "), f"{PNG}: expected a PNG"),
-    "png empty": (lambda t: fringe_path(t).write_bytes(b""), f"{PNG}: expected a PNG"),
     "png of 16 bits": (lambda t: png(t, np.uint16(fringe_of(STEM))), f"{PNG}: expected an 8-bit PNG, got 16 bits"),
     "png with alpha": (lambda t: png(t, np.zeros((24, 24, 4), np.uint8)), f"{PNG}: expected a grey PNG"),
     "png in colour": (rgb_with_a_colour, f"{PNG}: an RGB image whose channels differ"),
     "png of another size": (lambda t: png(t, fringe_of(STEM)[:20]), f"{PNG}: expected 24 x 24 px"),
     "mat cut off": (lambda t: cut(depth_path(t)), f"{MAT}: a data element"),
-    "mat damaged": (lambda t: flip(depth_path(t), -20), f"{MAT}: "),
-    "no mat at all": (lambda t: depth_path(t).write_bytes(b"1,2,3" * 90), f"{MAT}: expected a MATLAB"),
     "wrong variable": (
         lambda t: mat(t, depthMapMeters=depth_of(STEM)),
         f"{MAT}: expected the variable depthMap, got depthMapMeters",
     ),
     "depth of another size": (lambda t: mat(t, depthMap=depth_of(STEM)[:, :20]), f"{MAT}: expected 24 x 24"),
     "depth NaN": (lambda t: set_pixel(depth_path(t), np.nan), f"{MAT}: 1 pixels are NaN"),
-    "depth infinite": (lambda t: set_pixel(depth_path(t), np.inf), f"{MAT}: 1 pixels are NaN"),
     "depth negative": (lambda t: set_pixel(depth_path(t), -1), f"{MAT}: 1 pixels are negative"),
     "depth empty": (lambda t: mat(t, depthMap=np.zeros((24, 24))), f"{MAT}: no pixel is above 0"),
     "depth in cm": (lambda t: mat(t, depthMap=depth_of(STEM) / 10), "the file has another unit (times 10 it fits)"),
-    "depth in tenths of a mm": (
-        lambda t: mat(t, depthMap=np.uint16(10 * depth_of(STEM))),
-        "the file has another unit (times 0.1 it fits)",
-    ),
     "depth with a mark": (
         lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), 65535)),
         f"{MAT}: 79% of the pixels are exactly 65535, far from all depths: a value for background?",
+    ),
+    "depth in tenths of a mm": (
+        lambda t: mat(t, depthMap=np.uint16(10 * depth_of(STEM))),
+        "the file has another unit (times 0.1 it fits)",
     ),
     "depth with -1": (
         lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), -1)),
@@ -336,7 +330,6 @@ def test_a_long_list_of_wrong_files_is_cut_with_their_count(tmp_path):
     [
         (lambda t: None, "no such folder"),
         (lambda t: t.mkdir(), "expected training_datasets/"),
-        (lambda t: t.write_text("x"), "no such folder"),
         (lambda t: (t / "fpp_synthetic_dataset/mug/A0").mkdir(parents=True), "raw scans alone have no depth in mm"),
         (lambda t: (t / TRAINING / "training_data_bgremoved_depth_raw").mkdir(parents=True), "only background-removed"),
         (lambda t: (t / TRAINING / FOLDERS["raw"]).mkdir(parents=True), "holds no sample"),
@@ -399,8 +392,6 @@ def test_the_command_imports_and_prints_a_summary(tmp_path, capsys):
 @pytest.mark.parametrize(
     "words",
     [
-        ("import", "nowhere", "--out", "out"),
-        ("import", "tree", "--out", "out", "--workers", "0"),
         ("import", "tree", "--out", "out", "--frame-order", "sideways"),
         ("import", "tree", "--out", "out", "--rig", "nowhere.yaml"),
         ("import", "tree", "--out", "tree"),
@@ -419,14 +410,7 @@ def test_bad_input_to_the_command_is_a_message_and_status_2(tmp_path, monkeypatc
     assert not (tmp_path / "out" / "manifest.json").exists()
 
 
-def test_grey_levels_survive_opencv_and_its_rgb(tmp_path):
-    """The strict reader and OpenCV agree on the written files."""
-    tree = make_tree(tmp_path / "tree", splits={"test": SPLITS["test"]})
-    assert np.array_equal(cv2.imread(str(fringe_path(tree)), cv2.IMREAD_GRAYSCALE), fringe_of(STEM))
-    assert imported(tree, tmp_path / "out").splits.keys() == {"test"}
-
-
-@pytest.mark.parametrize("mark", [1e10, 65535, -1, np.nan])
+@pytest.mark.parametrize("mark", [65535, -1, np.nan])
 def test_a_value_for_background_is_read_as_0(mark, tmp_path):
     plain, marked = make_tree(tmp_path / "plain"), make_tree(tmp_path / "marked")
     for file in (marked / RAW).rglob("*.mat"):

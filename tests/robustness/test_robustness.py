@@ -1,6 +1,7 @@
 """FPP-C: conditions, charges, honesty, resuming; on one object at a small size."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ import pytest
 
 from fpp_ml_bench.baselines.learned.scenes import HELD_OUT, drawn_light
 from fpp_ml_bench.baselines.method import Answer, Method
-from fpp_ml_bench.baselines.robustness import axes, run
+from fpp_ml_bench.baselines.robustness import axes
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Condition, FrameCache, Truth, corruptions, score
 from fpp_ml_bench.baselines.robustness.run import Setup, measure, robustness, write_page
 from fpp_ml_bench.baselines.trivial import ConstantMethod
@@ -166,7 +167,7 @@ def test_a_right_answer_is_better_than_silence_and_silence_than_an_error_above_t
     assert score(wrong, None, truth(), RULES, CHARGE_MM)["wrong_share"] == 1
 
 
-@pytest.mark.parametrize(("sigma_mm", "share"), [(5.0, 1.0), (74.0, 1.0), (76.0, 0.0), (300.0, 0.0)])
+@pytest.mark.parametrize(("sigma_mm", "share"), [(74.0, 1.0), (76.0, 0.0)])
 def test_a_lie_about_sigma_is_a_confident_error(sigma_mm, share):
     sigma = np.full((SIZE, SIZE), sigma_mm)
     scores = score(truth().depth_mm + 300, sigma, truth(), RULES, CHARGE_MM)
@@ -180,13 +181,14 @@ def test_stating_no_sigma_at_all_is_no_coverage():
     assert scores["confident_share"] == 0 and scores["coverage"] == 0
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
-def test_no_number_is_refused(bad):
+def test_no_number_is_refused():
     depth = truth().depth_mm.copy()
-    depth[0, 0] = bad
-    if not np.isfinite(bad):
-        with pytest.raises(PredictionError, match="depth: expected finite mm"):
-            score(depth, None, truth(), RULES, CHARGE_MM)
+    depth[0, 0] = np.nan
+    with pytest.raises(PredictionError, match="depth: expected finite mm"):
+        score(depth, None, truth(), RULES, CHARGE_MM)
+    with pytest.raises(PredictionError, match="sigma: expected finite mm"):
+        score(truth().depth_mm, depth, truth(), RULES, CHARGE_MM)
+    depth[0, 0] = -1.0
     with pytest.raises(PredictionError, match="sigma: expected finite mm"):
         score(truth().depth_mm, depth, truth(), RULES, CHARGE_MM)
     with pytest.raises(PredictionError, match="expected a map of"):
@@ -212,7 +214,7 @@ def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
 def test_measuring_resumes_axis_by_axis_and_refuses_another_methods_folder(tmp_path, monkeypatch):
     setup = Setup(Noisy(paper_rig(SIZE)), "test", SIZE, quick=True)
     first = measure(setup, tmp_path, ["ambient-light"])
-    monkeypatch.setattr(run, "_measure_object", None)  # nothing is left to do
+    monkeypatch.setattr(Noisy, "answer", None)  # nothing is left to do
     assert measure(setup, tmp_path, ["ambient-light"]) == first
     with pytest.raises(PredictionError, match="other quick"):
         measure(Setup(Noisy(paper_rig(SIZE)), "test", SIZE), tmp_path, ["ambient-light"])
@@ -242,7 +244,7 @@ def test_processes_and_a_cluster_give_the_same_rows_as_one(tmp_path, fake_ray):
 def test_the_cache_is_used_mended_and_kept_small(tmp_path, monkeypatch):
     first = frames("ambient-light", 2, cache=tmp_path)
     (file,) = tmp_path.rglob("*.npy")
-    monkeypatch.setattr(axes, "_mesh", None)  # no object, nothing is rendered
+    monkeypatch.setattr(axes.Studio, "trace", None)  # nothing is rendered
     assert np.array_equal(frames("ambient-light", 2, cache=tmp_path)[0], first[0])
     monkeypatch.undo()
     file.write_bytes(file.read_bytes()[:500])
@@ -251,8 +253,6 @@ def test_the_cache_is_used_mended_and_kept_small(tmp_path, monkeypatch):
     newer = file.parent.stat().st_mtime + 10
     for folder in tmp_path.iterdir():
         if folder != file.parent:
-            import os
-
             os.utime(folder, (newer, newer))
     cache, size = FrameCache(tmp_path), file.stat().st_size
     cache.make_room(0, 2 * size)
@@ -323,26 +323,11 @@ def test_a_normalised_answer_and_an_unknown_axis_are_refused():
 
 def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
     out, cache = tmp_path / "out", tmp_path / "cache"
-    words = [
-        "robustness",
-        "constant",
-        "--at",
-        "training-mean",
-        "--quick",
-        "--size",
-        str(SIZE),
-        "--axes",
-        "read-noise",
-        "--workers",
-        "1",
-        "--out",
-        str(out),
-        "--cache",
-        str(cache),
-    ]
-    assert main(words) == 0
+    words = ["--quick", "--size", str(SIZE), "--axes", "read-noise", "--workers", "1"]
+    words += ["--out", str(out), "--cache", str(cache)]
+    assert main(["robustness", "constant", "--at", "training-mean", *words]) == 0
     assert "Constant depth: training-mean" in capsys.readouterr().out
-    assert main([*words[:2], "--at", "1700", *words[4:]]) == 0
+    assert main(["robustness", "constant", "--at", "1700", *words]) == 0
     page = (out / "index.html").read_text(encoding="utf-8")
     assert "Constant depth, 1700 mm" in page and "Constant depth: training-mean" in page and "<script" not in page
     assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
@@ -364,11 +349,7 @@ def test_the_scenes_show_the_fringes_that_an_option_asks_for(tmp_path):
     [
         (["constant", "--at", "nowhere"], "at 'nowhere': expected standoff"),
         (["constant", "--steps", "3"], "--steps is an option of classical, classical-net, not of constant"),
-        (["constant", "--axes", "glos"], "unknown axis 'glos'"),
-        (["constant", "--workers", "0"], "--workers 0: expected 1 or more"),
         (["constant", "--quick", "--into", "x.json"], "--into: needs all axes"),
-        (["unet-global-rmse"], "was trained at 224x224"),
-        (["no-such-method"], "unknown method"),
     ],
 )
 def test_bad_input_is_a_sentence_and_nothing_is_written(tmp_path, capsys, words, said):

@@ -11,12 +11,9 @@ import scipy.io
 import trimesh
 from conftest import TINY_CONFIGS, TINY_OBJECTS, file_bytes
 from published_trees import command, imported, write_png
-from scored_dataset import write_predictions
 
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
-from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import whole_folder
-from fpp_ml_bench.loaders.published import exporting as export_tree
 from fpp_ml_bench.loaders.published.exporting import chosen_splits, export
 from fpp_ml_bench.loaders.published.importing import import_notes
 from fpp_ml_bench.loaders.published.order import FrameOrder, parse_order
@@ -59,32 +56,6 @@ def test_the_tree_comes_back_bit_by_bit_with_the_same_split(opened, returned):
         for index in range(52):
             assert np.array_equal(returned.frame(sample, index), opened.frame(sample, index))
     assert returned.manifest.settings["frame_order"] == "paper"
-
-
-@pytest.mark.parametrize("split", ["test", "all"])
-def test_predictions_score_the_same_on_both(opened, returned, tmp_path, split):
-    predictions = write_predictions(tmp_path / "predictions", opened, split, offset_mm=1.7, noise_mm=20.0)
-    # The published layout has no flags, so its sets are the paper's.
-    original, reimported = (evaluate(predictions, dataset, split, mode="paper") for dataset in (opened, returned))
-    assert original.metrics == reimported.metrics and original.per_sample == reimported.per_sample
-    assert original.metrics.object_mae_mm > 1
-
-
-@pytest.mark.parametrize("variant", ["global_normalized", "individual_normalized"])
-def test_a_normalised_variant_alone_brings_back_the_same_float32(opened, tree, tmp_path, variant):
-    shutil.copytree(tree / TRAINING, tmp_path / "tree" / TRAINING)
-    for folder in (tmp_path / "tree" / TRAINING).glob("training_data_depth_*"):
-        if not folder.name.endswith(variant):
-            shutil.rmtree(folder)
-    dataset = imported(tmp_path / "tree", tmp_path / "out")
-    for sample in opened.samples("all"):
-        expected = opened.depth_mm(sample).copy()
-        if variant == "individual_normalized":
-            expected[expected == opened.measured(sample)["depth_min_mm"]] = 0
-        assert dataset.depth_mm(sample).tobytes() == expected.tobytes()
-    assert any("became background" in note for note in import_notes(dataset.manifest)) == variant.startswith(
-        "individual"
-    )
 
 
 def test_files_and_variables_are_those_of_the_published_layout(opened, tree):
@@ -166,17 +137,9 @@ BROKEN_SCANS = {
     "view missing": (lambda f: shutil.rmtree(f), "A60: the raw scan is missing"),
     "scan without depth": (lambda f: shutil.copytree(f, f.parents[1] / "mug/A60"), "A60: a raw scan without depth"),
     "no view at all": (lambda f: (f.parent / "A45").mkdir(), "A45: does not belong here"),
-    "frame of 16 bits": (
-        lambda f: write_png(f / "A_9.png", np.zeros((176, 176), np.uint16)),
-        "A_9.png: expected an 8-bit PNG, got 16 bits",
-    ),
     "frame of another size": (
         lambda f: write_png(f / "A_9.png", np.zeros((88, 88), np.uint8)),
         "A_9.png: expected 176 x 176 px",
-    ),
-    "frame damaged": (
-        lambda f: (f / "A_9.png").write_bytes((f / "A_9.png").read_bytes()[:-500]),
-        "A_9.png: the PNG is cut off",
     ),
     "not the single-shot frame": (lambda f: shutil.copy(f / "A_1.png", f / "A_0.png"), "A_0.png: differs from"),
     "two frames exchanged": (lambda f: swap(f / "A_20.png", f / "A_23.png"), "A_20.png: expected vertical sinusoid"),
@@ -288,16 +251,15 @@ def test_one_form_and_one_split_go_straight_into_the_folder(tiny, tmp_path):
 
 def test_a_full_disk_leaves_nothing_and_a_second_try_succeeds(opened, tmp_path, monkeypatch):
     out = tmp_path / "deep" / "out"
-    written = []
+    written, write = [], Path.write_bytes
 
     def full(path, content):
         written.append(path)
         if len(written) > 20:
             raise OSError(28, "No space left on device")
-        write(path, content)
+        return write(path, content)
 
-    write = export_tree._write
-    monkeypatch.setattr(export_tree, "_write", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(BuildError, match="No space left on device"):
         export(opened, out, ["mat"], ["test"], threads=2)
     assert list(out.parent.iterdir()) == []
@@ -328,26 +290,13 @@ def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp
         ("{data}", "--out", "out"),
         ("nowhere", "--out", "out", "--mat"),
         ("{data}", "--out", "file", "--mat"),
-        ("{data}", "--out", "full", "--mat"),
         ("{data}", "--out", "{data}", "--parquet"),
-        ("/dev/null", "--out", "out", "--patterns"),
-        ("{data}", "--out", "/proc/none/out", "--patterns"),
+        ("{data}", "--out", "out", "--parquet", "--split", "val"),
     ],
 )
 def test_bad_input_to_the_command_is_a_message_and_status_2(tiny, tmp_path, monkeypatch, capsys, words):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
-    Path("full").mkdir()
-    Path("full/mine").write_text("")
     assert command("export", *(word.format(data=tiny) for word in words)) == 2
     message = capsys.readouterr().err
     assert "error:" in message and "Traceback" not in message and not Path("out").exists()
-
-
-def test_an_unknown_split(opened, tmp_path, tiny):
-    folder = tmp_path / "one"
-    export(opened, tmp_path / "tree", ["mat"], ["test"])
-    dataset = imported(tmp_path / "tree", folder)
-    with pytest.raises(DatasetError, match="no split 'train'"):
-        chosen_splits(dataset, "train")
-    assert command("export", folder, "--out", tmp_path / "out", "--parquet", "--split", "train") == 2

@@ -21,7 +21,6 @@ from fpp_ml_bench.errors import BuildError, DatasetError, PoolError
 from fpp_ml_bench.loaders.render.builder import assembly_of, build
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.view import Studio
-from fpp_ml_bench.loaders.storage import assembly as assembling
 from fpp_ml_bench.loaders.storage.assembly import Assembly, assemble
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.loaders.storage.verification import verify
@@ -33,25 +32,20 @@ DIRECT = named_light("paper").changed("bounces", interreflection=False, ambient_
 SMALL = {"objects": ("cork",), "stored": "single_shot"}
 
 
-def build_arguments(folder, *more, workers=1):
-    return [
-        "build",
-        "--out",
-        str(folder),
-        "--size",
-        str(TINY_SIZE),
-        "--objects",
-        ",".join(TINY_OBJECTS),
-        "--workers",
-        str(workers),
-        *more,
-    ]
+def build_arguments(folder, *more, objects=TINY_OBJECTS, workers=1):
+    size, objects, workers = str(TINY_SIZE), ",".join(objects), str(workers)
+    return ["build", "--out", str(folder), "--size", size, "--objects", objects, "--workers", workers, *more]
 
 
-def start(folder, *more, **options):
+def half_arguments(folder, light):
+    """Of the dataset of `half_settings`."""
+    return build_arguments(folder, "--config", "single_shot", "--light", light, objects=("cork", "mug"))
+
+
+def start(arguments):
     """A build in a separate process and process group."""
     return subprocess.Popen(
-        [*COMMAND, *build_arguments(folder, *more, **options)],
+        [*COMMAND, *arguments],
         cwd=ROOT,
         start_new_session=True,
         stdout=subprocess.DEVNULL,
@@ -135,6 +129,7 @@ def uninterrupted(tmp_path_factory):
     return file_bytes(folder)
 
 
+@pytest.mark.processes
 def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, capsys):
     folder = tmp_path / "killed"
     work = folder / ".build"
@@ -155,7 +150,7 @@ def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, ca
     ]
     reached = 0
     for workers, moment in moments:
-        process = start(folder, workers=workers)
+        process = start(build_arguments(folder, workers=workers))
         if wait_for(moment, process):
             reached += 1
             if reached == 1:
@@ -242,8 +237,6 @@ def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_datas
     [
         ({"seed": 43}, r"seed \(there 42, now 43\)"),
         ({"objects": ("cork", "bowl")}, r"objects \(there \[\"mug\", \"cork\"\], now"),
-        ({"placement": "varied"}, "placement"),
-        ({"stored": "all"}, "stored"),
         ({"light": named_light("hard")}, "light"),
     ],
 )
@@ -265,19 +258,7 @@ def test_half_a_dataset_of_another_version_is_not_finished(half_built, monkeypat
 def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, direct_light, capsys):
     build(half_built, half_settings(), workers=1)
     stamps = {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()}
-    arguments = [
-        "build",
-        "--out",
-        str(half_built),
-        "--size",
-        str(TINY_SIZE),
-        "--objects",
-        "mug,cork",
-        "--config",
-        "single_shot",
-        "--light",
-        direct_light,
-    ]
+    arguments = half_arguments(half_built, direct_light)
     assert main(arguments) == 0
     assert "complete already" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()} == stamps
@@ -325,6 +306,7 @@ def die(plan, folder):
     return assembly_of(half_settings()).rows(plan, folder)
 
 
+@pytest.mark.processes
 def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_path, uninterrupted):
     folder = tmp_path / "set"
     assembly = assembly_of(half_settings())
@@ -336,9 +318,10 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
     assert file_bytes(folder) == uninterrupted
 
 
+@pytest.mark.processes
 def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted, direct_light):
     folder = tmp_path / "set"
-    process = start(folder, "--objects", "cork,mug", "--config", "single_shot", "--light", direct_light, workers=2)
+    process = start([*half_arguments(folder, direct_light), "--workers", "2"])
     assert wait_for(lambda: list(folder.glob("*/.*.tmp")), process)
     os.killpg(process.pid, signal.SIGTERM)
     errors = process.communicate(timeout=60)[1]
@@ -355,69 +338,19 @@ def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted,
 # ---- full disks
 
 
-@pytest.fixture
-def full_disk(tmp_path):
-    """Where it can't be mounted, the test with a file-size limit covers the case."""
-    with small_disk(tmp_path / "disk", "1500k") as folder:
-        yield folder
+def test_full_disk_is_refused_beforehand(tmp_path, capsys):
+    with small_disk(tmp_path / "disk", "1500k") as full_disk:
+        assert main(build_arguments(full_disk / "set", objects=("cork",))) == 2
+        message = capsys.readouterr().err
+        assert "GB free" in message and str(full_disk) in message
+        assert not final_shards(full_disk)
 
 
-def test_full_disk_is_refused_beforehand(full_disk, capsys):
-    arguments = [
-        "build",
-        "--out",
-        str(full_disk / "set"),
-        "--size",
-        str(TINY_SIZE),
-        "--objects",
-        "cork",
-        "--workers",
-        "1",
-    ]
-    assert main(arguments) == 2
-    message = capsys.readouterr().err
-    assert "GB free" in message and str(full_disk) in message
-    assert not final_shards(full_disk)
-
-
-def test_disk_that_fills_up_during_the_build(full_disk, uninterrupted, monkeypatch, capsys):
-    """A real ENOSPC in the second shard; after freeing space the same command resumes."""
-    monkeypatch.setattr(assembling, "check_space", lambda *_: None)
-    folder = full_disk / "set"
-    for filler_kb in (300, 0):  # 1.2 MB without the filler: one shard fits, not two
-        filler = full_disk / "filler"
-        filler.write_bytes(b"x" * 1024 * filler_kb)
-        with pytest.raises(BuildError, match=r"No space left on device.*resumes"):
-            build(folder, half_settings(), workers=1)
-        for shard in final_shards(folder):
-            assert shard.read_bytes() == uninterrupted[str(shard.relative_to(folder))]
-        assert not list(folder.rglob("*.tmp"))
-        assert not (folder / "manifest.json").exists()
-        filler.unlink()
-    subprocess.run(["mount", "-o", "remount,size=20m", str(full_disk)], check=True)
-    build(folder, half_settings(), workers=1)
-    assert file_bytes(folder) == uninterrupted
-
-
+@pytest.mark.processes
 def test_files_that_can_not_grow(tmp_path, direct_light, uninterrupted):
-    """The same through a limit on file sizes (EFBIG), which needs no privileges, and the real command."""
+    """No space in the middle of a shard, through a limit on file sizes (EFBIG), which needs no privileges."""
     folder = tmp_path / "set"
-    arguments = [
-        *COMMAND,
-        "build",
-        "--out",
-        str(folder),
-        "--size",
-        str(TINY_SIZE),
-        "--objects",
-        "cork,mug",
-        "--config",
-        "single_shot",
-        "--light",
-        direct_light,
-        "--workers",
-        "1",
-    ]
+    arguments = [*COMMAND, *half_arguments(folder, direct_light)]
     limit = 1_000_000  # bytes; a shard has 1.7 million
 
     def no_large_files():

@@ -34,7 +34,7 @@ def plain_arrow(path, column, row):
 
 @pytest.mark.parametrize(
     ("group", "column", "index"),
-    [("data", "frame_00", 0), ("horizontal", "frame_17", 17), ("vertical", "frame_18", 18), ("codes", "frame_51", 51)],
+    [("data", "frame_00", 0), ("horizontal", "frame_17", 17), ("codes", "frame_51", 51)],
 )
 def test_frames_are_the_bytes_of_their_file(tiny, opened, group, column, index):
     path = next(tiny.rglob(f"train/{group}-*.arrow"))
@@ -99,11 +99,6 @@ def test_frames_in_the_order_of_the_indices(opened):
     stack = opened.frames("bowl_A0", [51, 0, 18])
     for frame, index in zip(stack, (51, 0, 18), strict=True):
         np.testing.assert_array_equal(frame, opened.frame("bowl_A0", index))
-    # White is brighter than black, and each frame of a sequence is another image.
-    white, black = opened.frame("bowl_A0", PAPER_SEQUENCE.white), opened.frame("bowl_A0", PAPER_SEQUENCE.black)
-    inside = opened.depth_mm("bowl_A0") > 0
-    assert white[inside].mean() > black[inside].mean() + 80
-    assert len({opened.frame("bowl_A0", i).tobytes() for i in range(52)}) == 52
 
 
 def test_void_is_of_the_decoded_depth_or_of_scene_and_light_alone(opened):
@@ -149,7 +144,6 @@ def test_pickles_by_path(opened):
             "unknown depth column 'depth_min'; there are depth and depth_exact",
         ),
         (lambda d: d.samples("val"), "no split 'val'; there are train, validation, test and all"),
-        (lambda d: d.split_of_sample(""), "no sample ''"),
     ],
 )
 def test_errors_of_reading(opened, call, message):
@@ -164,11 +158,7 @@ def test_errors_of_reading(opened, call, message):
         (lambda p: p.mkdir(), "no manifest.json there"),
         (lambda p: (p / ".build").mkdir(parents=True), "not finished"),
         (lambda p: (p.mkdir(), (p / "manifest.json").write_text("{")), "damaged"),
-        (lambda p: (p.mkdir(), (p / "manifest.json").write_text("[]")), "damaged"),
-        (lambda p: (p.mkdir(), (p / "manifest.json").write_text("{}")), "damaged"),
-        (lambda p: (p.mkdir(), (p / "manifest.json").write_bytes(b"\xff\xfe\x00")), "damaged"),
         (lambda p: (p.mkdir(), (p / "manifest.json").write_text('{"fingerprint": 1, "schema_version": "9.0"}')), "9.0"),
-        (lambda p: p.write_text(""), "no such folder"),
     ],
 )
 def test_folders_that_are_no_dataset(tmp_path, make, message):
@@ -205,6 +195,7 @@ def test_same_length_but_no_arrow_is_an_error_not_a_crash(copied):
         opened.depth_mm("cork_A0")
 
 
+@pytest.mark.processes
 def test_reading_imports_neither_torch_nor_datasets_nor_pandas(tiny):
     code = (
         "import sys; from fpp_ml_bench.loaders.storage.store import DatasetFolder; d = DatasetFolder(sys.argv[1]);"
@@ -256,8 +247,8 @@ def changed(path, column, buffer, place, value):
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize("value", [2**31 - 1, -1, 10**6])
-@pytest.mark.parametrize("column, buffer", [("sample", 1), ("depth", 1), ("depth", 3), ("frame_00", 3)])
+@pytest.mark.parametrize("value", [2**31 - 1, -1])
+@pytest.mark.parametrize("column, buffer", [("sample", 1), ("depth", 1), ("depth", 3)])
 def test_offsets_that_lead_elsewhere_are_refused(tmp_path, column, buffer, value):
     path, size = shard_parts(tmp_path)
     OpenShard(path, size).check()
@@ -281,15 +272,13 @@ def written_anew(path, change, **options):
     "change, options",
     [
         (lambda columns: columns, {"compression": "lz4"}),
-        (lambda columns: columns, {"compression": "zstd"}),
         (lambda columns: {**columns, "depth": pa.nulls(len(columns["depth"]), columns["depth"].type)}, {}),
         (lambda columns: {**columns, "depth": columns["sample"].dictionary_encode()}, {}),
         (lambda columns: {**columns, "depth": columns["sample"]}, {}),
         (lambda columns: {**columns, "depth": pa.array([[[[1.0]]]] * len(columns["sample"]))}, {}),
-        (lambda columns: {**columns, "depth": pa.array([[["a"]]] * len(columns["sample"]))}, {}),
         (lambda columns: {name: column for name, column in columns.items() if name != "depth"}, {}),
     ],
-    ids=["lz4", "zstd", "nulls", "dictionary", "text", "deeper", "words", "missing"],
+    ids=["lz4", "nulls", "dictionary", "text", "deeper", "missing"],
 )
 def test_shards_of_another_form_are_refused(tmp_path, change, options):
     path, size = shard_parts(tmp_path)
