@@ -1,4 +1,5 @@
-"""Methods that turn fringes into depth (`fpp_ml_bench.baselines.method`), and running them over a split.
+"""Methods that turn fringes into depth (`fpp_ml_bench.baselines.method`), and running them over a
+split.
 
 >>> from fpp_ml_bench.baselines import build, load
 >>> network = build("unet")                              # bare and untrained    # doctest: +SKIP

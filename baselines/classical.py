@@ -1,8 +1,8 @@
-"""Classical multi-frame FPP: phase and order by whatever a rig codes, in the paper N steps and Gray code, then
-triangulation (paper Section 2.1).
+"""Classical multi-frame FPP: phase and order by whatever a rig codes, in the paper N steps and Gray
+code, then triangulation (paper Section 2.1).
 
-With all steps and both directions it is the process that made the ``depth`` column, so only ``--target depth_exact``
-shows its error.
+With all steps and both directions it is the process that made the ``depth`` column, so only
+``--target depth_exact`` shows its error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,28 +44,34 @@ DIRECTIONS: tuple[Directions, ...] = get_args(Directions)
 class ClassicalOptions:
     """Options of `ClassicalMethod`; ``threads`` a sample."""
 
-    steps: int | None = option(None, "phase steps a direction, 3 to 18, with Gray code (default: all)", "N")
+    steps: int | None = option(
+        None, "phase steps a direction, 3 to 18, with Gray code (default: all)", "N"
+    )
     direction: Directions = option(
         "both",
         "fringes to use: one direction is enough for a depth (default: all that the rig codes)",
     )
     fewest: bool = option(
-        False, "capture only the Gray frames that the rig's range needs: with both directions usually none"
+        False,
+        "capture only the Gray frames that the rig's range needs: with both directions usually "
+        "none",
     )
     depth_noise: float | None = option(
         None,
-        "the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
+        "the fewest steps whose depth noise at the far end of the range is at most this (instead "
+        "of --steps)",
         "MM",
     )
     threads: int = 1
 
 
 class ClassicalMethod(Method):
-    """All that a rig codes in one direction or "both", decoded. With the paper's kind of code, ``steps`` of the N
-    sinusoids (default: all) and the Gray code, or with ``fewest`` only those of its frames that the rig's working range
-    needs (`fpp_ml_bench.decoding.fewest`). Metric, nothing learned. Raises `RigError` for a direction that the rig does
-    not code, `DecodeError` for steps that were not captured, and for ``steps`` or ``fewest`` with another kind, and
-    `PredictionError` for ``depth_noise``, which needs a dataset."""
+    """All that a rig codes in one direction or "both", decoded. With the paper's kind of code,
+    ``steps`` of the N sinusoids (default: all) and the Gray code, or with ``fewest`` only those of
+    its frames that the rig's working range needs (`fpp_ml_bench.decoding.fewest`). Metric, nothing
+    learned. Raises `RigError` for a direction that the rig does not code, `DecodeError` for steps
+    that were not captured, and for ``steps`` or ``fewest`` with another kind, and `PredictionError`
+    for ``depth_noise``, which needs a dataset."""
 
     name = "classical"
     purpose = "N-step phase, Gray-code order, triangulation"
@@ -76,7 +82,9 @@ class ClassicalMethod(Method):
         direction, steps, fewest = self.options.direction, self.options.steps, self.options.fewest
         threads = self.options.threads
         if self.options.depth_noise is not None:
-            raise PredictionError(f"{self.name}: depth_noise needs a dataset, which says how noisy its frames are")
+            raise PredictionError(
+                f"{self.name}: depth_noise needs a dataset, which says how noisy its frames are"
+            )
         directions = rig.directions if direction == "both" else (direction,)
         plans = [plan_direction(rig, way, steps) for way in directions]
         if fewest:
@@ -88,7 +96,8 @@ class ClassicalMethod(Method):
         if len(counts) > 1 or 0 in counts:
             if fewest:
                 raise DecodeError(
-                    "fewest: frames can be left out only with sinusoids of one period in equal steps from pixel 0 and "
+                    "fewest: frames can be left out only with sinusoids of one period in equal "
+                    "steps from pixel 0 and "
                     "Gray code in half periods; the code of this rig is another: leave fewest out"
                 )
             self.steps = None
@@ -108,7 +117,8 @@ class ClassicalMethod(Method):
 
     @classmethod
     def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
-        """With the steps that ``depth_noise`` mm takes, by the light and the camera that the dataset was built with."""
+        """With the steps that ``depth_noise`` mm takes, by the light and the camera that the
+        dataset was built with."""
         if (depth_noise_mm := options.pop("depth_noise", None)) is not None:
             options["steps"] = _steps_for(dataset, depth_noise_mm, options)
         return cls.for_rig(dataset.rig, **options)
@@ -125,14 +135,18 @@ class ClassicalMethod(Method):
         if not submission.name.startswith("Classical "):
             return None
         settings = submission.settings
-        steps, direction = index(settings["steps"]), DIRECTIONS[DIRECTIONS.index(settings["direction"])]  # type: ignore[arg-type]
+        steps, direction = (
+            index(settings["steps"]),
+            DIRECTIONS[DIRECTIONS.index(settings["direction"])],
+        )  # type: ignore[arg-type]
         if not settings.get("fewest"):
             return f"Classical {steps}+Gray, {direction}"
         gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)
         return f"Classical {steps}, {direction}, {f'{gray} Gray' if gray else 'no Gray'}"
 
     def decode(self, frames: Frames, details: bool = False) -> Decoded:
-        """`decode_stack` of a captured sequence, without reasons; frames that are not in `frames_used` may be None."""
+        """`decode_stack` of a captured sequence, without reasons; frames that are not in
+        `frames_used` may be None."""
         return decode_stack(
             frames,
             self.rig,
@@ -148,19 +162,23 @@ class ClassicalMethod(Method):
         return self.decode(frames).depth_mm
 
     def answer(self, frames: Frames) -> Answer:
-        """Depth, and its standard uncertainty by the noise of the frames, light of further bounces and the calibration;
-        none for a code that has none by pixel."""
+        """Depth, and its standard uncertainty by the noise of the frames, light of further bounces
+        and the calibration; none for a code that has none by pixel."""
         return self._measured(frames, self.rig, STATED_SYSTEMATIC_RAD)[0]
 
     def measure(self, frames: Frames) -> tuple[Answer, NDArray[np.float32]]:
-        """`answer`, and the modulation in grey levels (H, W), the larger of both directions; 0 where there is none. The
-        uncertainty is that of neighbours against each other, by which networks compare them: without the calibration's
-        error, which they share."""
+        """`answer`, and the modulation in grey levels (H, W), the larger of both directions; 0
+        where there is none. The uncertainty is that of neighbours against each other, by which
+        networks compare them: without the calibration's error, which they share."""
         return self._measured(frames, replace(self.rig, calibration_px=0.0), SYSTEMATIC_RAD)
 
-    def _measured(self, frames: Frames, rig: Rig, systematic_rad: float) -> tuple[Answer, NDArray[np.float32]]:
+    def _measured(
+        self, frames: Frames, rig: Rig, systematic_rad: float
+    ) -> tuple[Answer, NDArray[np.float32]]:
         decoded = self.decode(frames, details=True)
-        measured = np.stack([measured.modulation for measured in decoded.details.values()]).max(axis=0)
+        measured = np.stack([measured.modulation for measured in decoded.details.values()]).max(
+            axis=0
+        )
         modulation = np.nan_to_num(measured).astype(np.float32)
         if not all(isinstance(self.rig.code(way), PhaseShift) for way in decoded.details):
             return Answer(decoded.depth_mm), modulation
@@ -171,12 +189,17 @@ class ClassicalMethod(Method):
 
 
 def _steps_for(dataset: Photographed, depth_noise_mm: float, options: Mapping[str, Any]) -> int:
-    """The fewest steps whose depth noise at the far end of the working range is at most ``depth_noise_mm``."""
+    """The fewest steps whose depth noise at the far end of the working range is at most
+    ``depth_noise_mm``."""
     described = dataset.manifest.settings.get("light")
     if options.get("steps") is not None or not 0 < depth_noise_mm < float("inf"):
-        raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
+        raise PredictionError(
+            f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps"
+        )
     if not isinstance(described, dict):
-        raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
+        raise PredictionError(
+            "--depth-noise: this dataset does not say how noisy its frames are; give --steps"
+        )
     light = validate(Light, described, dataset.path / "manifest.json", "light", PredictionError)
     far_mm = dataset.rig.working_range_mm[1]
     modulation = modulation_at(dataset.rig, far_mm, light)
@@ -185,7 +208,8 @@ def _steps_for(dataset: Photographed, depth_noise_mm: float, options: Mapping[st
     steps = fewest_steps(dataset.rig, direction, depth_noise_mm, modulation, noise_grey)
     if steps is None:
         raise PredictionError(
-            f"--depth-noise {depth_noise_mm:g}: more noise remains even with all {dataset.sequence.steps} steps that "
+            f"--depth-noise {depth_noise_mm:g}: more noise remains even with all "
+            f"{dataset.sequence.steps} steps that "
             "were captured; allow more noise, or use both directions"
         )
     return steps

@@ -1,5 +1,5 @@
-"""What a method is: a class that says its name, options, assumptions and training itself. No other file knows a method
-by its name; `registry` finds the classes.
+"""What a method is: a class that says its name, options, assumptions and training itself. No other
+file knows a method by its name; `registry` finds the classes.
 
 A whole method, in a file ``mine.py`` of its own, for ``fpp-bench predict mine.py:Mine data/mini``:
 
@@ -42,13 +42,25 @@ if TYPE_CHECKING:
 
 Frames = Sequence[NDArray[np.uint8] | None]
 """A captured sequence by frame number, with None for frames that are not needed."""
-FRAMEWORKS = ("cv2", "jax", "onnxruntime", "scipy", "skimage", "sklearn", "tensorflow", "torch", "torchvision")
-"""Modules whose versions are stated of a method of a file where they are loaded: nobody has to say so."""
+FRAMEWORKS = (
+    "cv2",
+    "jax",
+    "onnxruntime",
+    "scipy",
+    "skimage",
+    "sklearn",
+    "tensorflow",
+    "torch",
+    "torchvision",
+)
+"""Modules whose versions are stated of a method of a file where they are loaded: nobody has to say
+so."""
 Setting = str | int | float | bool | None
 
 
 class Photographed(Protocol):
-    """What a method can be made for: a dataset, or scenes of a rig that are rendered and not stored."""
+    """What a method can be made for: a dataset, or scenes of a rig that are rendered and not
+    stored."""
 
     @property
     def path(self) -> Path: ...
@@ -63,8 +75,9 @@ class Photographed(Protocol):
 
 
 class Answer(NamedTuple):
-    """``depth`` float32 (H, W) in the method's units, 0 = background or not measured; ``sigma_mm``: its standard
-    uncertainty, float32 (H, W), 0 where none is stated, None of a method that states none; ``report``: plain data."""
+    """``depth`` float32 (H, W) in the method's units, 0 = background or not measured; ``sigma_mm``:
+    its standard uncertainty, float32 (H, W), 0 where none is stated, None of a method that states
+    none; ``report``: plain data."""
 
     depth: NDArray[np.float32]
     sigma_mm: NDArray[np.float32] | None = None
@@ -72,7 +85,8 @@ class Answer(NamedTuple):
 
 
 class Assumption(NamedTuple):
-    """What a method assumes of every scene: in a few ``words`` for a table, and as a ``sentence``."""
+    """What a method assumes of every scene: in a few ``words`` for a table, and as a
+    ``sentence``."""
 
     words: str
     sentence: str
@@ -85,36 +99,49 @@ class NoOptions:
 
 @dataclass(frozen=True)
 class OwnViews:
-    """Options of a training that renders what it learns from; None: as the shipped weights were trained."""
+    """Options of a training that renders what it learns from; None: as the shipped weights were
+    trained."""
 
     steps: int | None = option(None, "training steps (default: as the shipped weights)", "N")
     unions: int | None = option(
-        None, "images that join several objects, made from each sample (default: as the shipped weights)", "N"
+        None,
+        "images that join several objects, made from each sample (default: as the shipped weights)",
+        "N",
     )
-    lights: int | None = option(None, "lights that are drawn at random (default: as the shipped weights)", "N")
-    rate: float | None = option(None, "largest learning rate (default: as the shipped weights)", "R")
+    lights: int | None = option(
+        None, "lights that are drawn at random (default: as the shipped weights)", "N"
+    )
+    rate: float | None = option(
+        None, "largest learning rate (default: as the shipped weights)", "R"
+    )
 
 
 class Method:
-    """A frame stack in, a depth map out. A subclass needs ``name``, ``title``, ``frames_used``, and `predict` or
-    `answer`. `answer` is what is scored, timed and measured; where a class does not define it, it calls `predict`.
+    """A frame stack in, a depth map out. A subclass needs ``name``, ``title``, ``frames_used``, and
+    `predict` or `answer`. `answer` is what is scored, timed and measured; where a class does not
+    define it, it calls `predict`.
 
-    name: what it is called on the command line and in submissions. purpose: what it does, one line of ``--help``.
-    Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
-    takes a method. Training: the same for ``fpp-bench train``, None where there is nothing to train. trivial: whether
-    it ignores the image (a constant) or only looks up the nearest training image: a reference for other errors.
+    name: what it is called on the command line and in submissions. purpose: what it does, one line
+    of ``--help``.
+    Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of
+    every command that takes a method. Training: the same for ``fpp-bench train``, None where there
+    is nothing to train. trivial: whether it ignores the image (a constant) or only looks up the
+    nearest training image: a reference for other errors.
     title: name of the submission, with the settings that matter.
-    frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
+    frames_used: frames that must be captured, ascending. settings: everything needed to run it
+    again.
     uses_ground_truth_range: whether it is given depth_min and depth_max of the sample it predicts.
     range_rule: by which range normalised depth is.
     uses_ground_truth_mask: whether it is given frames that are 0 outside the object.
-    mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
-    packages: those whose versions matter, for a class outside this package beside `FRAMEWORKS`. parameters: numbers
-    that were learned. weights_config: what its weights file says of the network and its training data. learned_from:
-    what data it learned from, as `evaluation.submission.LearnedFrom` has it; a class outside this package
-    says so itself, like ``learned_from = {"data": "other", "versions": ["my scans"]}``, and without that it is unknown.
-    code: hashes of the files of a class outside this package. batched: whether `predict_batch` takes all samples at
-    once. reports: whether `answer` reports.
+    mode, target: what its row is scored in and against; for a network the decoded depth, which it
+    was trained on.
+    packages: those whose versions matter, for a class outside this package beside `FRAMEWORKS`.
+    parameters: numbers that were learned. weights_config: what its weights file says of the network
+    and its training data. learned_from: what data it learned from, as
+    `evaluation.submission.LearnedFrom` has it; a class outside this package says so itself, like
+    ``learned_from = {"data": "other", "versions": ["my scans"]}``, and without that it is unknown.
+    code: hashes of the files of a class outside this package. batched: whether `predict_batch`
+    takes all samples at once. reports: whether `answer` reports.
     """
 
     name: str
@@ -143,14 +170,15 @@ class Method:
     reports: bool = False
 
     def __init__(self, rig: Rig, **options: Any) -> None:
-        """For images of ``rig``; ``options`` are the fields of `Options`, and become the settings of its submission.
-        `PredictionError` for an option that it does not have."""
+        """For images of ``rig``; ``options`` are the fields of `Options`, and become the settings
+        of its submission. `PredictionError` for an option that it does not have."""
         self.rig, self.options = rig, self.checked_options(options)
         self.settings = {**self.settings, **plain_settings(self.options)}
 
     @classmethod
     def checked_options(cls, given: Mapping[str, Any]) -> Any:
-        """`Options` with the values ``given``, by name. `PredictionError` for a name that it does not have."""
+        """`Options` with the values ``given``, by name. `PredictionError` for a name that it does
+        not have."""
         known = [entry.name for entry in fields(cls.Options)]
         for name in given:
             if name not in known:
@@ -160,36 +188,39 @@ class Method:
 
     @classmethod
     def for_rig(cls, rig: Rig, **options: Any) -> "Method":
-        """The method for images of ``rig``. A class that makes another one for some options overrides this."""
+        """The method for images of ``rig``. A class that makes another one for some options
+        overrides this."""
         return cls(rig, **options)
 
     @classmethod
     def for_dataset(cls, dataset: "Photographed", **options: Any) -> "Method":
-        """The method for a dataset. A class that needs more of it than the rig (its training split, the light it was
-        built with) overrides this."""
+        """The method for a dataset. A class that needs more of it than the rig (its training split,
+        the light it was built with) overrides this."""
         return cls.for_rig(dataset.rig, **options)
 
     @classmethod
     def train(cls, training: Any, out: Path, minutes: float | None = None) -> bool:
-        """Learn by ``training``, an instance of `Training`, into the folder ``out``; within ``minutes``, everything
-        saved, and continued by the next call. Prints what came of it. Whether the training has finished."""
+        """Learn by ``training``, an instance of `Training`, into the folder ``out``; within
+        ``minutes``, everything saved, and continued by the next call. Prints what came of it.
+        Whether the training has finished."""
         raise PredictionError(f"{cls.name}: there is nothing to train")
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
-        """The options with which ``fpp-bench tradeoff`` measures it on ``rig``; none for a rig that it can't be for."""
+        """The options with which ``fpp-bench tradeoff`` measures it on ``rig``; none for a rig that
+        it can't be for."""
         return [{}]
 
     @classmethod
     def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
-        """Which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``, with
-        these ``settings`` (an option that is not given may be missing)."""
+        """Which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench
+        robustness``, with these ``settings`` (an option that is not given may be missing)."""
         return "paper"
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:
-        """A short name for tables, made of the settings of a submission of this method; None for one that it did not
-        write. May raise KeyError, TypeError or ValueError for such settings."""
+        """A short name for tables, made of the settings of a submission of this method; None for
+        one that it did not write. May raise KeyError, TypeError or ValueError for such settings."""
         return None
 
     @classmethod
@@ -198,10 +229,13 @@ class Method:
         return None
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in `units`, 0 = background or not measured; frames not in `frames_used` may be None."""
+        """Depth float32 (H, W) in `units`, 0 = background or not measured; frames not in
+        `frames_used` may be None."""
         return self.answer(frames).depth
 
-    def predict_batch(self, stacks: Sequence[Frames]) -> Sequence[NDArray[np.float32]] | NDArray[np.float32]:
+    def predict_batch(
+        self, stacks: Sequence[Frames]
+    ) -> Sequence[NDArray[np.float32]] | NDArray[np.float32]:
         """The depth of several samples, one after another unless `batched`."""
         return [self.answer(frames).depth for frames in stacks]
 
@@ -210,7 +244,8 @@ class Method:
         return Answer(self.predict(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice] | None:
-        """Rows and columns outside which nothing is computed; None for a method that computes everywhere."""
+        """Rows and columns outside which nothing is computed; None for a method that computes
+        everywhere."""
         return None
 
     def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -227,7 +262,9 @@ class Method:
     @property
     def settings_of_depth(self) -> dict[str, Setting]:
         """The settings without those of the machine, which change its time and not its depth."""
-        return {key: value for key, value in self.settings.items() if key not in ("threads", "device")}
+        return {
+            key: value for key, value in self.settings.items() if key not in ("threads", "device")
+        }
 
     @property
     def weights_sha256(self) -> str | None:
@@ -249,21 +286,28 @@ class Method:
 
 
 def checked(answer: Answer, size: tuple[int, int], where: object) -> Answer:
-    """``answer`` if its maps are finite float32 of ``size`` (H, W), as `Method.answer` must give them; else
-    `PredictionError`, which begins with ``where``."""
+    """``answer`` if its maps are finite float32 of ``size`` (H, W), as `Method.answer` must give
+    them; else `PredictionError`, which begins with ``where``."""
     if not isinstance(answer, Answer):
-        raise PredictionError(f"{where}: answer gave {type(answer).__name__}, expected Answer(depth)")
+        raise PredictionError(
+            f"{where}: answer gave {type(answer).__name__}, expected Answer(depth)"
+        )
     for values in (answer.depth, *([] if answer.sigma_mm is None else [answer.sigma_mm])):
         found = f"{getattr(values, 'dtype', type(values).__name__)} {np.shape(values)}"
         if found != (expected := f"float32 {size}"):
             raise PredictionError(f"{where}: the method gave {found}, expected {expected}")
         if not np.isfinite(values).all():
-            raise PredictionError(f"{where}: the method gave values that are not finite: a fault of the method")
+            raise PredictionError(
+                f"{where}: the method gave values that are not finite: a fault of the method"
+            )
     return answer
 
 
-def training_split_of(benchmark: "Benchmark | TrainingBenchmark | None", fingerprint: str) -> dict[str, Any]:
-    """`Method.learned_from` of a method that learned from the training split of a dataset, a ``benchmark`` or not."""
+def training_split_of(
+    benchmark: "Benchmark | TrainingBenchmark | None", fingerprint: str
+) -> dict[str, Any]:
+    """`Method.learned_from` of a method that learned from the training split of a dataset, a
+    ``benchmark`` or not."""
     title = f"dataset {fingerprint[:8]}" if benchmark is None else benchmark.title
     return {"data": "train-split", "versions": [title]}
 
@@ -275,4 +319,7 @@ def is_built_in(part: Callable[..., Any]) -> bool:
 
 def plain_settings(options: Any) -> dict[str, Setting]:
     """The values of an instance of `Method.Options` as a submission states them: a path as text."""
-    return {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
+    return {
+        key: str(value) if isinstance(value, Path) else value
+        for key, value in asdict(options).items()
+    }

@@ -1,5 +1,5 @@
-"""Finding a method: those of this package and of installed packages by name, one of a file as ``mine.py:Mine``, and
-trained networks by the name or path of their weights.
+"""Finding a method: those of this package and of installed packages by name, one of a file as
+``mine.py:Mine``, and trained networks by the name or path of their weights.
 
 An installed package offers methods by the entry point group `GROUP`:
 
@@ -49,7 +49,20 @@ NETWORKS = "networks.network_method:NetworkMethod"
 """The class that trained networks from image to depth are made with, by their weights."""
 
 
-WEIGHTS = (".bin", ".ckpt", ".h5", ".joblib", ".mat", ".npy", ".npz", ".onnx", ".pkl", ".pt", ".pth", ".safetensors")
+WEIGHTS = (
+    ".bin",
+    ".ckpt",
+    ".h5",
+    ".joblib",
+    ".mat",
+    ".npy",
+    ".npz",
+    ".onnx",
+    ".pkl",
+    ".pt",
+    ".pth",
+    ".safetensors",
+)
 """How files of weights end: those that the code of a method names are a part of it."""
 
 
@@ -61,8 +74,8 @@ class Found(NamedTuple):
 
 
 def methods() -> dict[str, type[Method]]:
-    """The methods by name: those of this package, then those of installed ones. What an installed package offers and
-    can't be used is left out here; `find` says why when it is asked for."""
+    """The methods by name: those of this package, then those of installed ones. What an installed
+    package offers and can't be used is left out here; `find` says why when it is asked for."""
     return {**{method.name: method for method in map(_built_in, BUILT_IN)}, **_installed()[0]}
 
 
@@ -72,9 +85,10 @@ def network_method() -> type[Method]:
 
 
 def find(name: str | Path) -> Found:
-    """The class that ``name`` means: a method's name, ``file.py:Class`` (the file is executed), or weights that come
-    with the package or in a ``.safetensors`` file, or a recipe that ``fpp-bench reproduce`` has trained. Raises
-    `PredictionError`, for an unknown name with what it might have meant."""
+    """The class that ``name`` means: a method's name, ``file.py:Class`` (the file is executed), or
+    weights that come with the package or in a ``.safetensors`` file, or a recipe that ``fpp-bench
+    reproduce`` has trained. Raises `PredictionError`, for an unknown name with what it might have
+    meant."""
     text = str(name)
     if text.endswith(".py"):
         text += ":"
@@ -92,13 +106,16 @@ def find(name: str | Path) -> Found:
     from fpp_ml_bench.baselines.training.weights import shipped_names, weights_path
 
     try:
-        if text.endswith((".yaml", ".yml")) or (text.split("/")[0] in TABLES and not text.endswith(".safetensors")):
+        if text.endswith((".yaml", ".yml")) or (
+            text.split("/")[0] in TABLES and not text.endswith(".safetensors")
+        ):
             return Found(network_method(), {"recipe": text})
         return Found(network_method(), {"weights": weights_path(name)})
     except WeightsError:
         hint = did_you_mean(text, [*known, *shipped_names()])
         raise PredictionError(
-            f"unknown method {printable(text, 200)!r}; {hint}. A method is a name, file.py:Class, or a .safetensors "
+            f"unknown method {printable(text, 200)!r}; {hint}. A method is a name, file.py:Class, "
+            f"or a .safetensors "
             "file of trained weights"
         ) from None
 
@@ -110,44 +127,61 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     >>> from fpp_ml_bench.baselines.registry import load_method
     >>> depth_mm = load_method("phase", dataset).predict(frames)    # doctest: +SKIP
 
-    Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
+    Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights,
+    invalid options.
     """
     method, preset = find(name)
     own_answer = method.answer is not Method.answer
     if method.predict is Method.predict and not own_answer:
         raise PredictionError(f"{name}: does not define predict, or answer, which a method needs")
     if own_answer and is_built_in(method.answer) and not is_built_in(method.predict):
-        raise PredictionError(f"{name}: what it inherits answers without its predict; define answer instead")
+        raise PredictionError(
+            f"{name}: what it inherits answers without its predict; define answer instead"
+        )
     shown = source.without_truth() if isinstance(source, DatasetFolder) else source
     make = method.for_rig if isinstance(shown, Rig) else method.for_dataset
     made = make(shown, **preset, **options)  # type: ignore[arg-type]
     given = {**{entry.name: entry.default for entry in fields(method.Options)}, **options}
     files = {key: Path(value) for key, value in given.items() if isinstance(value, str | Path)}
-    settings: dict[str, Setting] = {f"{key}_sha256": _sha256(path) for key, path in files.items() if is_file(path)}
+    settings: dict[str, Setting] = {
+        f"{key}_sha256": _sha256(path) for key, path in files.items() if is_file(path)
+    }
     settings |= made.settings
     if (digest := source_sha256(method)) is not None:
         made.code, settings["source_sha256"] = code_of(method), digest
     try:
         made.settings = settings
     except AttributeError:
-        raise PredictionError(f"{name}: settings is read only; set it in __init__, as a dictionary") from None
+        raise PredictionError(
+            f"{name}: settings is read only; set it in __init__, as a dictionary"
+        ) from None
     return made
 
 
 def load_from_file(text: str) -> Any:
-    """The object that ``file.py:name`` means; the file is executed once. `PredictionError` where that fails."""
+    """The object that ``file.py:name`` means; the file is executed once. `PredictionError` where
+    that fails."""
     path_text, _, name = text.rpartition(":")
     module = _module_of(Path(path_text).resolve())
     try:
         return getattr(module, name)
     except AttributeError:
-        own = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
-        wrong = f"has no {printable(name)!r}" if name else f"expected {path_text}:NAME, which says what of it"
+        own = [
+            key
+            for key, value in vars(module).items()
+            if getattr(value, "__module__", "") == module.__name__
+        ]
+        wrong = (
+            f"has no {printable(name)!r}"
+            if name
+            else f"expected {path_text}:NAME, which says what of it"
+        )
         raise PredictionError(f"{path_text}: {wrong}; {did_you_mean(name, own)}") from None
 
 
 def code_of(method: type[Method]) -> dict[str, str]:
-    """`code_in` the file of a class; empty for one of this package, whose version says what it is."""
+    """`code_in` the file of a class; empty for one of this package, whose version says what it
+    is."""
     file = None if is_built_in(method) else inspect.getsourcefile(method)
     return {} if file is None else code_in(Path(file), method.__module__.partition(".")[0])
 
@@ -160,9 +194,10 @@ def source_sha256(method: type[Method]) -> str | None:
 
 @cache
 def code_in(file: Path, package: str = "") -> dict[str, str]:
-    """What ``file`` is made of: by their path from its folder the SHA-256 of itself, of what is imported from beside it
-    or from its ``package``, and of files of `WEIGHTS` that a text in these names. What the code puts together while it
-    runs is not seen. Read once, as the file is executed once."""
+    """What ``file`` is made of: by their path from its folder the SHA-256 of itself, of what is
+    imported from beside it or from its ``package``, and of files of `WEIGHTS` that a text in these
+    names. What the code puts together while it runs is not seen. Read once, as the file is executed
+    once."""
     paths = {file}
     for name, module in sys.modules.copy().items():
         top, path = name.partition(".")[0], Path(getattr(module, "__file__", None) or "")
@@ -174,7 +209,9 @@ def code_in(file: Path, package: str = "") -> dict[str, str]:
         for node in ast.walk(ast.parse(path.read_bytes())):
             if isinstance(node, ast.Constant) and str(node.value).endswith(WEIGHTS):
                 paths |= {path.parent / str(node.value), Path(str(node.value)).resolve()}
-    return {os.path.relpath(path, file.parent): _sha256(path) for path in sorted(paths) if is_file(path)}
+    return {
+        os.path.relpath(path, file.parent): _sha256(path) for path in sorted(paths) if is_file(path)
+    }
 
 
 def _sha256(path: Path) -> str:
@@ -183,14 +220,23 @@ def _sha256(path: Path) -> str:
 
 
 def failure_in_file(error: BaseException) -> str | None:
-    """Where and why code of a file given as ``file.py:Class`` failed, for a message; None for any other error."""
-    own = [frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename) in _FILES]
-    return f"{own[-1].filename}, line {own[-1].lineno}, in {own[-1].name}: {_cause(error)}" if own else None
+    """Where and why code of a file given as ``file.py:Class`` failed, for a message; None for any
+    other error."""
+    own = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if Path(frame.filename) in _FILES
+    ]
+    return (
+        f"{own[-1].filename}, line {own[-1].lineno}, in {own[-1].name}: {_cause(error)}"
+        if own
+        else None
+    )
 
 
 def _let_workers_have(method: type[Method], place: str) -> None:
-    """Instances of a class of a file go to other processes with its ``place``, for its module can't be imported there
-    by name."""
+    """Instances of a class of a file go to other processes with its ``place``, for its module can't
+    be imported there by name."""
 
     def reduced(self: Method, protocol: object) -> tuple[Any, ...]:
         return _of_file, (place, pickle.dumps(vars(self)))
@@ -227,7 +273,11 @@ def _module_of(path: Path) -> Any:
     except FppBenchError:
         raise
     except (Exception, SystemExit) as error:  # the user's code can raise anything
-        own = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        own = [
+            frame
+            for frame in traceback.extract_tb(error.__traceback__)
+            if frame.filename == str(path)
+        ]
         line = f" (line {own[-1].lineno})" if own else ""
         raise PredictionError(f"{path}: importing it failed: {_cause(error)}{line}") from error
     finally:
@@ -244,7 +294,8 @@ def _built_in(place: str) -> type[Method]:
 
 @cache
 def _installed() -> tuple[dict[str, type[Method]], dict[str, str]]:
-    """Methods of installed packages by name, and what is wrong with those that can't be used, by the name offered."""
+    """Methods of installed packages by name, and what is wrong with those that can't be used, by
+    the name offered."""
     taken = {method.name for method in map(_built_in, BUILT_IN)}
     usable: dict[str, type[Method]] = {}
     unusable: dict[str, str] = {}
@@ -255,10 +306,14 @@ def _installed() -> tuple[dict[str, type[Method]], dict[str, str]]:
         except PredictionError as error:
             unusable[entry.name] = str(error)
         except Exception as error:  # whatever a stranger's package does when it is imported
-            unusable[entry.name] = f"{where} can't be imported: {_cause(error)}; repair or uninstall it"
+            unusable[entry.name] = (
+                f"{where} can't be imported: {_cause(error)}; repair or uninstall it"
+            )
         else:
             if method.name in taken or method.name in usable:
-                unusable[entry.name] = f"{where}: the name {method.name!r} is taken; uninstall one of the two"
+                unusable[entry.name] = (
+                    f"{where}: the name {method.name!r} is taken; uninstall one of the two"
+                )
             else:
                 usable[method.name] = method
     return usable, unusable
@@ -267,10 +322,19 @@ def _installed() -> tuple[dict[str, type[Method]], dict[str, str]]:
 def _checked(method: Any, where: str) -> type[Method]:
     """``method`` if it is a class of methods that says what it must."""
     if not (isinstance(method, type) and issubclass(method, Method)):
-        raise PredictionError(f"{where}: expected a subclass of fpp_ml_bench.Method, got {type(method).__name__}")
+        raise PredictionError(
+            f"{where}: expected a subclass of fpp_ml_bench.Method, got {type(method).__name__}"
+        )
     name = getattr(method, "name", None)
-    if not isinstance(name, str) or not name or printable(name) != name or any(c in name for c in " /:\\"):
-        raise PredictionError(f"{where}: its name is {name!r}; expected text without spaces, slashes and colons")
+    if (
+        not isinstance(name, str)
+        or not name
+        or printable(name) != name
+        or any(c in name for c in " /:\\")
+    ):
+        raise PredictionError(
+            f"{where}: its name is {name!r}; expected text without spaces, slashes and colons"
+        )
     return method
 
 

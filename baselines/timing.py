@@ -31,7 +31,8 @@ _MIB = 2.0**20
 OF_THE_MACHINE = {"threads", "device"}
 """Settings that two runs of the same method may differ in."""
 BATCH_SHARE = 0.01
-"""Share of an image's pixels, as at the edge of a mask, that rounding may turn by 1% in a batch of a network."""
+"""Share of an image's pixels, as at the edge of a mask, that rounding may turn by 1% in a batch of
+a network."""
 
 
 def time_method(
@@ -42,19 +43,24 @@ def time_method(
     repeats: int = 20,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> Timing:
-    """Time `Method.answer` on images of ``split``: see `Timing` for what each figure means. Frames are in memory before
-    the clock starts, at most ``batch`` sequences of them: no reading or writing counts. Raises `DatasetError` for an
-    empty split, or when the dataset lacks a frame that the method needs, and `PredictionError` as `check_batch`."""
+    """Time `Method.answer` on images of ``split``: see `Timing` for what each figure means. Frames
+    are in memory before the clock starts, at most ``batch`` sequences of them: no reading or
+    writing counts. Raises `DatasetError` for an empty split, or when the dataset lacks a frame that
+    the method needs, and `PredictionError` as `check_batch`."""
     samples = opened.samples(split)
     if not samples:
-        raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to time")
+        raise DatasetError(
+            f"{opened.path}: split {split} holds no sample; there is nothing to time"
+        )
     if batch < 1 or repeats < 1:
         raise ValueError(f"expected a batch and repeats of at least 1, got {batch} and {repeats}")
     # A batch larger than the split holds its samples again: views, which cost no memory.
     stacks = [captured_frames(opened, method, sample) for sample in samples[:batch]]
     cuda: Any = import_module("torch").cuda if method.device.startswith("cuda") else None
     # Calls to a GPU return before their work is done.
-    finish: Callable[[], object] = partial(cuda.synchronize, method.device) if cuda is not None else lambda: None
+    finish: Callable[[], object] = (
+        partial(cuda.synchronize, method.device) if cuda is not None else lambda: None
+    )
 
     def seconds(run: Callable[[], object]) -> float:
         finish()
@@ -82,7 +88,9 @@ def time_method(
         rates.append(batch / seconds(lambda: method.predict_batch(batch_stacks)))
     low, high = (float(np.percentile(latencies_ms, q)) for q in (5, 95))
     # getrusage(2): kB on Linux, bytes on macOS
-    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (_MIB if sys.platform == "darwin" else 1024)
+    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+        _MIB if sys.platform == "darwin" else 1024
+    )
     return Timing(
         provenance="measured",
         latency_median_ms=four_digits(statistics.median(latencies_ms)),
@@ -94,7 +102,9 @@ def time_method(
         throughput_per_s=four_digits(statistics.median(rates)),
         peak_memory_mib=round(peak_mib, 1),
         working_memory_mib=working_mib,
-        gpu_memory_mib=None if cuda is None else round(cuda.max_memory_allocated(method.device) / _MIB, 1),
+        gpu_memory_mib=None
+        if cuda is None
+        else round(cuda.max_memory_allocated(method.device) / _MIB, 1),
         parameters=method.parameters,
         frames=len(method.frames_used),
         image_size=list(opened.size),
@@ -105,8 +115,8 @@ def time_method(
 
 
 def check_batch(method: Method, stacks: Sequence[Frames]) -> None:
-    """Raise `PredictionError` where `predict_batch`, whose time is the throughput, gives other depths than `answer`,
-    which is scored, in more than `BATCH_SHARE` of the pixels."""
+    """Raise `PredictionError` where `predict_batch`, whose time is the throughput, gives other
+    depths than `answer`, which is scored, in more than `BATCH_SHARE` of the pixels."""
     if type(method).predict_batch is Method.predict_batch:
         return
     together = method.predict_batch(stacks)
@@ -115,7 +125,8 @@ def check_batch(method: Method, stacks: Sequence[Frames]) -> None:
         same = len(together) == len(stacks) and np.shape(together[number]) == alone.shape
         if not same or not np.isclose(together[number], alone, rtol=0.01).mean() > 1 - BATCH_SHARE:
             raise PredictionError(
-                f"{method.name}: predict_batch gives other depths than one image after another, which is what is "
+                f"{method.name}: predict_batch gives other depths than one image after another, "
+                f"which is what is "
                 "scored; make both the same, or leave predict_batch out"
             )
 
@@ -126,13 +137,16 @@ def four_digits(value: float) -> float:
 
 
 def added_mib(run: Callable[[], Any]) -> float | None:
-    """By how much ``run`` raises the resident set at its highest, in MiB to a tenth; None where the kernel does not
-    tell."""
+    """By how much ``run`` raises the resident set at its highest, in MiB to a tenth; None where the
+    kernel does not tell."""
     try:
-        # What earlier runs freed goes back to the system (malloc_trim(3)), so that the next run's use shows.
+        # What earlier runs freed goes back to the system (malloc_trim(3)), so that the next run's
+        # use shows.
         gc.collect()
         getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: None)(0)
-        Path("/proc/self/clear_refs").write_text("5")  # resets the peak of the resident set, VmHWM (proc(5))
+        Path("/proc/self/clear_refs").write_text(
+            "5"
+        )  # resets the peak of the resident set, VmHWM (proc(5))
         before = _status_mib("VmRSS")
         run()
         return round(max(0.0, _status_mib("VmHWM") - before), 1)
@@ -147,14 +161,15 @@ def _status_mib(key: str) -> float:
 
 
 def check_target(path: Path, method: Method) -> None:
-    """Refuse, before any work, a file that is no submission or result, or that describes another method. Raises
-    SubmissionError, which says what differs."""
+    """Refuse, before any work, a file that is no submission or result, or that describes another
+    method. Raises SubmissionError, which says what differs."""
     check_same_method(path, _described(path)[0], method, timed=True)
 
 
 def check_same_method(path: Path, about: Submission, method: Method, timed: bool = False) -> None:
-    """Refuse (SubmissionError) to measure ``method`` for the file ``path``, which is ``about`` another one: name,
-    frames, units, or a setting that both have; to be ``timed`` also threads, device, and a setting that one lacks."""
+    """Refuse (SubmissionError) to measure ``method`` for the file ``path``, which is ``about``
+    another one: name, frames, units, or a setting that both have; to be ``timed`` also threads,
+    device, and a setting that one lacks."""
     keys = about.settings.keys() & method.settings.keys() - OF_THE_MACHINE
     if timed:  # a summary of reports is added to the settings of what was predicted
         keys = method.settings.keys() | (() if method.reports else about.settings.keys())
@@ -162,19 +177,25 @@ def check_same_method(path: Path, about: Submission, method: Method, timed: bool
         "method": (about.method, method.name),
         "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
         "units": (about.units, method.units),
-        **{f"settings.{key}": (about.settings.get(key), method.settings.get(key)) for key in sorted(keys)},
+        **{
+            f"settings.{key}": (about.settings.get(key), method.settings.get(key))
+            for key in sorted(keys)
+        },
     }
     for key, (in_file, measured) in pairs.items():
         if in_file != measured:
             raise SubmissionError(
-                f"{printable(str(path), 500)}: {key} is {printable(str(in_file))}, but {printable(str(measured))} for "
-                "the method to measure; what is measured belongs to the very method that was scored: give the same "
+                f"{printable(str(path), 500)}: {key} is {printable(str(in_file))}, but "
+                f"{printable(str(measured))} for "
+                "the method to measure; what is measured belongs to the very method that was "
+                "scored: give the same "
                 "options and code, or predict and score again"
             )
 
 
 def write_timing(path: Path, timing: Timing) -> None:
-    """Put ``timing`` into the file, with ``seconds_per_sample`` and ``hardware`` as measured. See `check_target`."""
+    """Put ``timing`` into the file, with ``seconds_per_sample`` and ``hardware`` as measured. See
+    `check_target`."""
     content = timing.model_dump(mode="json")
     measured = {
         "seconds_per_sample": timing.latency_median_ms / 1000,
@@ -196,5 +217,7 @@ def _described(path: Path) -> tuple[Submission, Result | None]:
         result = read_result(path)
         return result.submission, result
     if path.name != SUBMISSION_FILE:
-        raise SubmissionError(f"{printable(str(path), 500)}: expected a {SUBMISSION_FILE} or a result file (*.json)")
+        raise SubmissionError(
+            f"{printable(str(path), 500)}: expected a {SUBMISSION_FILE} or a result file (*.json)"
+        )
     return read_submission(path.parent), None

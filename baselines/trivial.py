@@ -1,5 +1,5 @@
-"""Trivial methods: a constant depth, and the depth of the nearest training image. Their errors are the reference that
-tells what another method's error is worth."""
+"""Trivial methods: a constant depth, and the depth of the nearest training image. Their errors are
+the reference that tells what another method's error is worth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"
 TRAINING_MEAN_MM, TRAINING_MEAN_DATA = 1743.75, "fpp-bench-full version 1"
 """Mean exact depth over the object pixels of the training split of that benchmark."""
 RANGE_SHARES = {"range-middle": 0.5, "range-training": 0.294}
-"""Constants as shares of a given depth range, that of the pixels that are not void: its middle, and `best_range_share`
-of the training split of `RANGE_DATA`."""
+"""Constants as shares of a given depth range, that of the pixels that are not void: its middle, and
+`best_range_share` of the training split of `RANGE_DATA`."""
 RANGE_DATA = "fpp-bench-full-224 version 2"
 BLOCKS = 60
 """Blocks along an image's shorter side, by whose means `NearestMethod` compares images."""
@@ -35,16 +35,19 @@ class ConstantOptions:
 
     at: str | float = option(
         STANDOFF,
-        "standoff, middle (of the working range), training-mean, or a depth in mm; range-middle or range-training: the "
-        "middle of the sample's depth range, or its best share on the training split; the range is then given",
+        "standoff, middle (of the working range), training-mean, or a depth in mm; range-middle or "
+        "range-training: the "
+        "middle of the sample's depth range, or its best share on the training split; the range is "
+        "then given",
         "DEPTH",
     )
 
 
 class ConstantMethod(Method):
-    """One depth at every pixel: ``at`` the rig's standoff, the middle of its working range, the mean of the benchmark's
-    training split, or so many mm. Or one of `RANGE_SHARES` of the sample's depth range, which it is then given, as a
-    network of the oracle range track is: normalised depth. Raises PredictionError for anything else."""
+    """One depth at every pixel: ``at`` the rig's standoff, the middle of its working range, the
+    mean of the benchmark's training split, or so many mm. Or one of `RANGE_SHARES` of the sample's
+    depth range, which it is then given, as a network of the oracle range track is: normalised
+    depth. Raises PredictionError for anything else."""
 
     name = "constant"
     purpose = "the same depth at every pixel"
@@ -65,12 +68,19 @@ class ConstantMethod(Method):
         except ValueError:
             self.value = -1.0
         if not 0 < self.value < 1e6:
-            raise PredictionError(f"at {at!r}: expected {', '.join(known)}, or a depth in mm above 0")
+            raise PredictionError(
+                f"at {at!r}: expected {', '.join(known)}, or a depth in mm above 0"
+            )
         self.shape = rig.camera.height, rig.camera.width
         self.frames_used = rig.sequence.config("single_shot")
         self.title = f"Constant depth, {at} mm" if at not in known else f"Constant depth: {at}"
         if at in RANGE_SHARES:
-            self.uses_ground_truth_range, self.units, self.mode, self.target = True, "normalised", "paper", "depth"
+            self.uses_ground_truth_range, self.units, self.mode, self.target = (
+                True,
+                "normalised",
+                "paper",
+                "depth",
+            )
             self.range_rule = "valid"
         self.settings = {"at": at, "share" if at in RANGE_SHARES else "depth_mm": self.value}
 
@@ -80,7 +90,9 @@ class ConstantMethod(Method):
 
     @property
     def learned_from(self) -> dict[str, Any] | None:
-        data = {TRAINING_MEAN: TRAINING_MEAN_DATA, "range-training": RANGE_DATA}.get(str(self.settings["at"]))
+        data = {TRAINING_MEAN: TRAINING_MEAN_DATA, "range-training": RANGE_DATA}.get(
+            str(self.settings["at"])
+        )
         return {"data": "train-split", "versions": [data]} if data else super().learned_from
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
@@ -88,8 +100,9 @@ class ConstantMethod(Method):
 
 
 def best_range_share(dataset: DatasetFolder, samples: Sequence[str]) -> float:
-    """The constant share of each sample's depth range with the least mean object MAE over ``samples``: the median over
-    their object pixels, each weighted by range over pixels. Ranges are those of pixels that are not void."""
+    """The constant share of each sample's depth range with the least mean object MAE over
+    ``samples``: the median over their object pixels, each weighted by range over pixels. Ranges are
+    those of pixels that are not void."""
     shares, weights = [], []
     for sample in samples:
         depth_mm = dataset.depth_mm(sample).astype(np.float64)
@@ -112,11 +125,13 @@ class NearestOptions:
 
 
 class NearestMethod(Method):
-    """The decoded depth of the training sample whose single-shot frame is nearest to the image: least sum of squared
-    differences of block means, the first one of equals. ``training``: the dataset that holds the training split, opened
-    or its folder. Sums are of whole numbers, so the choice is the same on every machine.
+    """The decoded depth of the training sample whose single-shot frame is nearest to the image:
+    least sum of squared differences of block means, the first one of equals. ``training``: the
+    dataset that holds the training split, opened or its folder. Sums are of whole numbers, so the
+    choice is the same on every machine.
 
-    Raises PredictionError for a dataset without a training split, or of another image size or sequence than ``rig``."""
+    Raises PredictionError for a dataset without a training split, or of another image size or
+    sequence than ``rig``."""
 
     name = "nearest"
     purpose = "depth of the training sample with the nearest image"
@@ -136,20 +151,26 @@ class NearestMethod(Method):
         training = self.checked_options(options).training
         if training is None:
             raise PredictionError(
-                f"{self.name} needs the training split: give the dataset that holds it (--training FOLDER)"
+                f"{self.name} needs the training split: give the dataset that holds it (--training "
+                f"FOLDER)"
             )
-        self.training = training if isinstance(training, DatasetFolder) else DatasetFolder(Path(training))
+        self.training = (
+            training if isinstance(training, DatasetFolder) else DatasetFolder(Path(training))
+        )
         size = rig.camera.height, rig.camera.width
         if "train" not in self.training.splits:
             raise PredictionError(
-                f"{self.training.path}: has no training split to choose from; give a dataset that has one "
+                f"{self.training.path}: has no training split to choose from; give a dataset that "
+                f"has one "
                 "(--training FOLDER)"
             )
         if (self.training.size, self.training.sequence.to_dict()) != (size, rig.sequence.to_dict()):
             (height, width), (other_height, other_width) = size, self.training.size
             raise PredictionError(
-                f"{self.training.path}: expected training images of {height}x{width} px (H x W) of the same sequence "
-                f"as those to predict, this dataset has {other_height}x{other_width} px or another sequence"
+                f"{self.training.path}: expected training images of {height}x{width} px (H x W) of "
+                f"the same sequence "
+                f"as those to predict, this dataset has {other_height}x{other_width} px or another "
+                f"sequence"
             )
         self.frames_used = rig.sequence.config("single_shot")
         self.samples = self.training.samples("train")
@@ -159,12 +180,17 @@ class NearestMethod(Method):
             sums.append(self._block_sums(self.training.frame(sample, self.frames_used[0])))
             self.training.release(sample)
         self._sums = np.array(sums)
-        self.settings = {"training_fingerprint": self.training.fingerprint, "block_px": self.block_px}
+        self.settings = {
+            "training_fingerprint": self.training.fingerprint,
+            "block_px": self.block_px,
+        }
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         frame = frames[self.frames_used[0]]
         if frame is None:
-            raise PredictionError(f"{self.name} needs frame {self.frames_used[0]}, and it is missing")
+            raise PredictionError(
+                f"{self.name} needs frame {self.frames_used[0]}, and it is missing"
+            )
         distances = ((self._sums - self._block_sums(frame)) ** 2).sum(axis=(1, 2))
         sample = self.samples[int(np.argmin(distances))]
         depth_mm = self.training.depth_mm(sample).astype(np.float32)
@@ -176,7 +202,8 @@ class NearestMethod(Method):
         return training_split_of(benchmark_of(self.training.content), self.training.fingerprint)
 
     def _block_sums(self, frame: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Sums of grey levels over blocks, (H // block, W // block); what is left over at the ends is not looked at."""
+        """Sums of grey levels over blocks, (H // block, W // block); what is left over at the ends
+        is not looked at."""
         side = self.block_px
         height, width = (length // side for length in frame.shape)
         blocks = frame[: height * side, : width * side].reshape(height, side, width, side)

@@ -1,12 +1,14 @@
-"""Write what the package knows of a named benchmark, ``loaders/storage/benchmarks/NAME.json``, from its build.
+"""Write what the package knows of a named benchmark, ``loaders/storage/benchmarks/NAME.json``, from
+its build.
 
     fpp-bench build data/full --preset full
     python benchmarks/benchmark_facts.py fpp-bench-full data/full
 
-Content hashes of every column of every split, and by object how many samples it has and how many of its pixels are
-object and void, by both modes and against both depths. The images are read (`fpp-bench verify`) before they are named.
-Prints how many pixels that count against the exact depth the full sequence does not decode, which is what the limit
-`loaders.sample.WEAK_GREY` was chosen by, on the training split.
+Content hashes of every column of every split, and by object how many samples it has and how many of
+its pixels are object and void, by both modes and against both depths. The images are read
+(`fpp-bench verify`) before they are named. Prints how many pixels that count against the exact
+depth the full sequence does not decode, which is what the limit `loaders.sample.WEAK_GREY` was
+chosen by, on the training split.
 """
 
 import argparse
@@ -30,17 +32,22 @@ def counts(dataset: DatasetFolder, split: str, mode: str, target: str) -> dict[s
         inside, void = object_mask(dataset.target_mm(sample, target)), dataset.void(sample, target)
         void &= mode == "standard"
         numbers = found.setdefault(dataset.measured(sample)["object"], [0, 0, 0])
-        for place, number in enumerate((1, np.count_nonzero(inside & ~void), np.count_nonzero(void))):
+        for place, number in enumerate(
+            (1, np.count_nonzero(inside & ~void), np.count_nonzero(void))
+        ):
             numbers[place] += int(number)
         dataset.release(sample)
     return found
 
 
 def undecoded_share(dataset: DatasetFolder, split: str) -> float:
-    """Share of the pixels that count as object against the exact depth which have no decoded depth."""
+    """Share of the pixels that count as object against the exact depth which have no decoded
+    depth."""
     counted = undecoded = 0
     for sample in dataset.samples(split):
-        inside = object_mask(dataset.target_mm(sample, "depth_exact")) & ~dataset.void(sample, "depth_exact")
+        inside = object_mask(dataset.target_mm(sample, "depth_exact")) & ~dataset.void(
+            sample, "depth_exact"
+        )
         counted += np.count_nonzero(inside)
         undecoded += np.count_nonzero(inside & ~object_mask(dataset.depth_mm(sample)))
         dataset.release(sample)
@@ -49,7 +56,9 @@ def undecoded_share(dataset: DatasetFolder, split: str) -> float:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("name", choices=[benchmark.name for benchmark in BENCHMARKS], metavar="NAME")
+    parser.add_argument(
+        "name", choices=[benchmark.name for benchmark in BENCHMARKS], metavar="NAME"
+    )
     parser.add_argument("dataset", type=Path, help="its build")
     parser.add_argument("--out", type=Path, default=FACTS, help="folder to write into")
     args = parser.parse_args()
@@ -64,16 +73,23 @@ def main() -> int:
     facts = {
         "content": dataset.content,
         "counts": {
-            split: {f"{mode}/{target}": counts(dataset, split, mode, target) for mode, target in rules}
+            split: {
+                f"{mode}/{target}": counts(dataset, split, mode, target) for mode, target in rules
+            }
             for split in dataset.splits
         },
     }
     args.out.mkdir(exist_ok=True)
     file = args.out / f"{args.name}.json"
-    file.write_text(json.dumps(facts, separators=(",", ":"), sort_keys=True).replace('},"', '},\n"') + "\n")
+    file.write_text(
+        json.dumps(facts, separators=(",", ":"), sort_keys=True).replace('},"', '},\n"') + "\n"
+    )
     print(f"{file}: {file.stat().st_size} bytes")
     for split in dataset.splits:
-        print(f"{split}: {100 * undecoded_share(dataset, split):.4f}% of the pixels that count are not decoded")
+        print(
+            f"{split}: {100 * undecoded_share(dataset, split):.4f}% of the pixels that count are "
+            f"not decoded"
+        )
     return 0
 
 

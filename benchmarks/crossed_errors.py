@@ -1,14 +1,17 @@
-"""Where the millimetres of one crossed frame are, and what the mask costs when the frame is disturbed.
+"""Where the millimetres of one crossed frame are, and what the mask costs when the frame is
+disturbed.
 
     python benchmarks/crossed_errors.py DATASET [--method crossed] [--split validation] [--views 3] [--only KIND]
 
-DATASET: built with ``fpp-bench build --rig crossed``. Every kind of disturbance changes the same views by arithmetic on
-their grey levels, by known masks and exact depths: noise, texture in patches and checks on the object, gamma. For each
-are printed: object pixels without a depth (missed) and background pixels with one (invented), both as a share of the
-image; median, MAE and RMSE of what is answered, the MAE over the whole object (a missed pixel counts with its depth),
-and seconds a frame; on stderr also which share of the pixels the stated intervals hold, and MAE and RMSE of the surest
-95% of what is answered. Then, of the undisturbed views, which share of the pixels, of the absolute and of the squared
-error is missed, a wrong order, near a depth edge, and the rest. Void pixels count nowhere.
+DATASET: built with ``fpp-bench build --rig crossed``. Every kind of disturbance changes the same
+views by arithmetic on their grey levels, by known masks and exact depths: noise, texture in patches
+and checks on the object, gamma. For each are printed: object pixels without a depth (missed) and
+background pixels with one (invented), both as a share of the image; median, MAE and RMSE of what is
+answered, the MAE over the whole object (a missed pixel counts with its depth), and seconds a frame;
+on stderr also which share of the pixels the stated intervals hold, and MAE and RMSE of the surest
+95% of what is answered. Then, of the undisturbed views, which share of the pixels, of the absolute
+and of the squared error is missed, a wrong order, near a depth edge, and the rest. Void pixels
+count nowhere.
 """
 
 import argparse
@@ -48,11 +51,15 @@ def _noise(grey: Image, inside: Mask, draw: np.random.Generator) -> Image:
 
 
 def _patches(grey: Image, inside: Mask, draw: np.random.Generator) -> Image:
-    return np.where(inside, grey * _cells(grey.shape, PATCH_PX, draw.uniform(0.4, 1, (40, 40))), grey)
+    return np.where(
+        inside, grey * _cells(grey.shape, PATCH_PX, draw.uniform(0.4, 1, (40, 40))), grey
+    )
 
 
 def _checks(grey: Image, inside: Mask, draw: np.random.Generator) -> Image:
-    return np.where(inside, grey * _cells(grey.shape, CHECK_PX, np.array([[0.35, 1.0], [1.0, 0.35]])), grey)
+    return np.where(
+        inside, grey * _cells(grey.shape, CHECK_PX, np.array([[0.35, 1.0], [1.0, 0.35]])), grey
+    )
 
 
 def _patches_everywhere(grey: Image, inside: Mask, draw: np.random.Generator) -> Image:
@@ -94,9 +101,15 @@ KINDS: dict[str, Callable[[Image, Mask, np.random.Generator], Image]] = {
 
 
 def measured(
-    name: str, kind: str, dataset: DatasetFolder, samples: list[str], threshold: float | None, **options: Any
+    name: str,
+    kind: str,
+    dataset: DatasetFolder,
+    samples: list[str],
+    threshold: float | None,
+    **options: Any,
 ) -> dict[str, Any]:
-    """What a method makes of ``samples`` under a kind of disturbance, means over them; ``pixels``: by what they are."""
+    """What a method makes of ``samples`` under a kind of disturbance, means over them; ``pixels``:
+    by what they are."""
     method = load_method(name, dataset, **options)
     if threshold is not None:
         learned = replace(method.route.learned, threshold=threshold)
@@ -133,22 +146,36 @@ def measured(
         if answer.sigma_mm is not None and answered.any():
             sigma, off = answer.sigma_mm[answered], error[answered]
             surest = off[sigma <= np.quantile(sigma, SUREST)]
-            held = {f"within {name}": 100 * (off < width * sigma).mean() for name, width in INTERVALS.items()}
-            rows[-1] |= {**held, "surest": surest.mean(), "surest_rmse": np.sqrt((surest**2).mean())}
+            held = {
+                f"within {name}": 100 * (off < width * sigma).mean()
+                for name, width in INTERVALS.items()
+            }
+            rows[-1] |= {
+                **held,
+                "surest": surest.mean(),
+                "surest_rmse": np.sqrt((surest**2).mean()),
+            }
         edges = object_near_edges(exact, [NEAR_PX])[0]
         where = {"missed": true & (depth == 0)}
         where["wrong order"] = answered & (error > corruptions().wrong_order_mm)
         taken = where["missed"] | where["wrong order"]
         where[f"within {NEAR_PX} px of an edge"] = true & edges & ~taken
         where["the rest"] = true & ~edges & ~taken
-        parts.append({key: (mask.sum(), error[mask].sum(), (error[mask] ** 2).sum()) for key, mask in where.items()})
+        parts.append(
+            {
+                key: (mask.sum(), error[mask].sum(), (error[mask] ** 2).sum())
+                for key, mask in where.items()
+            }
+        )
     means = {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]}
     sums = {key: np.sum([part[key] for part in parts], axis=0) for key in parts[0]}
     return means | {"parts": sums}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("dataset")
     parser.add_argument("--method", default="crossed")
     parser.add_argument("--weights")
@@ -163,7 +190,9 @@ def main() -> None:
     options: dict[str, Any] = {"min_confidence": given.min_confidence}
     options |= {"weights": given.weights} if given.weights else {}
     options |= {"frames": given.frames} if given.method == "crossed" else {}
-    samples = [s for s in dataset.samples(given.split) if int(s.rpartition("_A")[2]) // 60 < given.views]
+    samples = [
+        s for s in dataset.samples(given.split) if int(s.rpartition("_A")[2]) // 60 < given.views
+    ]
     rows = []
     parts = None
     for kind in [given.only] if given.only else KINDS:
@@ -183,7 +212,11 @@ def main() -> None:
                 "s": f"{found['seconds']:.2f}",
             }
         )
-        stated = {key: round(value, 2) for key, value in found.items() if key.startswith(("within", "surest"))}
+        stated = {
+            key: round(value, 2)
+            for key, value in found.items()
+            if key.startswith(("within", "surest"))
+        }
         print(rows[-1] | stated, file=sys.stderr, flush=True)
     title = f"{given.method}, {len(samples)} views of {given.split}, {given.dataset}"
     print("\n".join([title, "", *Table.of(title, rows, words=(0,)).markdown(), ""]))
@@ -194,7 +227,9 @@ def main() -> None:
                 "pixels": key,
                 **{
                     n: f"{100 * v:.2f}%"
-                    for n, v in zip(("share", "of the error", "squared"), values / totals, strict=True)
+                    for n, v in zip(
+                        ("share", "of the error", "squared"), values / totals, strict=True
+                    )
                 },
             }
             for key, values in parts.items()

@@ -1,13 +1,15 @@
-"""Measured and expected errors of crossed fringes over their period: what ``fpp-bench patterns --design`` assumes.
+"""Measured and expected errors of crossed fringes over their period: what ``fpp-bench patterns
+--design`` assumes.
 
     python benchmarks/crossed_sweep.py paper --pitches 6,8,10,12,14,18
     python benchmarks/crossed_sweep.py paper --focal 1.4 --baseline 1.5 --pitches 7,8,10,12
     python benchmarks/crossed_sweep.py paper --pair 10,12,30,75
 
-RIG: paper or a rig file; --focal and --baseline multiply the camera's focal length and the translation. The validation
-objects are rendered with one crossed frame of every period (`design.search.square_pair`, or the pairs of --pair) in
-every light, and measured by `crossed` with the true mask. For each are printed: mean absolute error of the two phases
-of a window along the line of depths; share of the pixels whose error across it is above 0.2 and 0.5 rad; wrong orders
+RIG: paper or a rig file; --focal and --baseline multiply the camera's focal length and the
+translation. The validation objects are rendered with one crossed frame of every period
+(`design.search.square_pair`, or the pairs of --pair) in every light, and measured by `crossed` with
+the true mask. For each are printed: mean absolute error of the two phases of a window along the
+line of depths; share of the pixels whose error across it is above 0.2 and 0.5 rad; wrong orders
 before and after neighbours help; MAE and RMSE of the object; and the error that the design expects.
 """
 
@@ -41,7 +43,9 @@ WRONG_MM = 40.0
 FAR = np.float32(1000.0)  # a depth in mm where there is none
 
 
-def measured(rig: Rig, family: Crossed, light: str, views: tuple[str, ...]) -> list[dict[str, float]]:
+def measured(
+    rig: Rig, family: Crossed, light: str, views: tuple[str, ...]
+) -> list[dict[str, float]]:
     """The figures of every view that the rig can place."""
     objects = tuple(name for name in OBJECTS if split_of(name) == "validation")
     shown = rig.with_crossed(replace(family, shifts_deg=FIRST_SHIFTED_DEG))
@@ -50,7 +54,9 @@ def measured(rig: Rig, family: Crossed, light: str, views: tuple[str, ...]) -> l
     for name in objects:
         for view in views:
             try:
-                frames, exact, flags = photographed(studio, name, view, (shown.sequence.crossed_frames[0],))
+                frames, exact, flags = photographed(
+                    studio, name, view, (shown.sequence.crossed_frames[0],)
+                )
             except FppBenchError:  # the object does not fit this camera's image
                 continue
             inside = exact > 0
@@ -73,7 +79,8 @@ def measured(rig: Rig, family: Crossed, light: str, views: tuple[str, ...]) -> l
                     "along, rad": np.abs(along).mean(),
                     "across > 0.2": 100 * (across > 0.2).mean(),
                     "> 0.5 rad, %": 100 * (across > 0.5).mean(),
-                    "wrong before, %": 100 * (np.abs(alone - truth) * carriers.joint_gain > WRONG_RAD)[points].mean(),
+                    "wrong before, %": 100
+                    * (np.abs(alone - truth) * carriers.joint_gain > WRONG_RAD)[points].mean(),
                     "after, %": 100 * (off_mm > WRONG_MM).mean(),
                     "MAE, mm": off_mm.mean(),
                     "RMSE, mm": np.sqrt((off_mm**2).mean()),
@@ -83,13 +90,17 @@ def measured(rig: Rig, family: Crossed, light: str, views: tuple[str, ...]) -> l
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("rig")
     parser.add_argument("--size", type=int, default=960)
     parser.add_argument("--focal", type=float, default=1.0)
     parser.add_argument("--baseline", type=float, default=1.0)
     parser.add_argument("--pitches", default="8,10,12,14,18")
-    parser.add_argument("--pair", action="append", default=[], help="P,Q,A,B: px and degrees, in place of --pitches")
+    parser.add_argument(
+        "--pair", action="append", default=[], help="P,Q,A,B: px and degrees, in place of --pitches"
+    )
     parser.add_argument("--lights", default="paper,workshop")
     parser.add_argument("--views", default=",".join(VIEWS[::2]))
     given = parser.parse_args()
@@ -107,7 +118,10 @@ def main() -> None:
             found = measured(rig, family, light, tuple(given.views.split(",")))
             means = {key: np.mean([row[key] for row in found]) for key in found[0]}
             named = {"periods, px": "{:g} / {:g}".format(*family.pitches_px), "light": light}
-            figures = {key: f"{value:.3f}" if key.endswith("rad") else f"{value:.2f}" for key, value in means.items()}
+            figures = {
+                key: f"{value:.3f}" if key.endswith("rad") else f"{value:.2f}"
+                for key, value in means.items()
+            }
             rows.append({**named, **figures, "expected, mm": f"{expected.expected_mm:.2f}"})
             print(rows[-1], flush=True)
     print("\n".join(Table.of(given.rig, rows, words=(0, 1)).markdown()))

@@ -1,22 +1,26 @@
-"""Decoding one view: this package against `fringes` and OpenCV's structured_light, in the same run on the same scene.
+"""Decoding one view: this package against `fringes` and OpenCV's structured_light, in the same run
+on the same scene.
 
     python benchmarks/decode_speed.py [--size 960] [--repeats 7]
 
-A tilted plane across the working range is seen by the paper's rig, with ambient light, noise of one grey level and
-8-bit rounding. Every method decodes what its own patterns look like in that scene, with as equal a number of frames as
-it can:
+A tilted plane across the working range is seen by the paper's rig, with ambient light, noise of one
+grey level and 8-bit rounding. Every method decodes what its own patterns look like in that scene,
+with as equal a number of frames as it can:
 
 - ours: 18 sinusoids + 7 Gray bits a direction, to depth in mm;
-- fringes: 18 + 7 sinusoids a direction at two frequencies (it has no Gray code), to projector coordinates; and on the
-  same 18 + 18 sinusoids as ours, where it unwraps in space, to a phase relative to an unknown number of periods;
-- OpenCV GrayCodePattern: 42 binary frames (21 and their inverses), black and white, to whole projector pixels with
-  one call a pixel from Python (timed on a sample of pixels and scaled up), or to a two-camera disparity map in one call
-  (timed on the stack passed twice, and halved). It has no phase;
-- OpenCV SinusoidalPattern (PSP): 3 of our 18 frames of one direction, to a phase unwrapped in space, relative to an
-  unknown whole number of periods, which is taken from the truth here.
+- fringes: 18 + 7 sinusoids a direction at two frequencies (it has no Gray code), to projector
+  coordinates; and on the same 18 + 18 sinusoids as ours, where it unwraps in space, to a phase
+  relative to an unknown number of periods;
+- OpenCV GrayCodePattern: 42 binary frames (21 and their inverses), black and white, to whole
+  projector pixels with one call a pixel from Python (timed on a sample of pixels and scaled up), or
+  to a two-camera disparity map in one call (timed on the stack passed twice, and halved). It has no
+  phase;
+- OpenCV SinusoidalPattern (PSP): 3 of our 18 frames of one direction, to a phase unwrapped in
+  space, relative to an unknown whole number of periods, which is taken from the truth here.
 
-Peers stop at the coordinate, so their depth is triangulated by us, outside their time; ours includes it. Errors are
-over each method's decoded pixels that lie 4 projector px or more inside the pattern.
+Peers stop at the coordinate, so their depth is triangulated by us, outside their time; ours
+includes it. Errors are over each method's decoded pixels that lie 4 projector px or more inside the
+pattern.
 """
 
 import argparse
@@ -59,7 +63,11 @@ class Scene(NamedTuple):
         images = []
         for pattern in patterns:
             light = cv2.remap(pattern.astype(np.float32), *maps, cv2.INTER_LINEAR)
-            noisy = AMBIENT + ALBEDO * light + NOISE * rng.standard_normal(light.shape, dtype=np.float32)
+            noisy = (
+                AMBIENT
+                + ALBEDO * light
+                + NOISE * rng.standard_normal(light.shape, dtype=np.float32)
+            )
             images.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
         return images
 
@@ -104,11 +112,23 @@ def run_ours(scene: Scene, repeats: int) -> list[Row]:
                 return decode_stack(frames, rig, direction, threads=threads)
 
             seconds, decoded = timed(call, repeats)
-            exact = decode_stack(frames, rig, direction, details=True).details["vertical"].coordinate_px
+            exact = (
+                decode_stack(frames, rig, direction, details=True).details["vertical"].coordinate_px
+            )
             depth = np.where(decoded.depth_mm > 0, decoded.depth_mm, np.nan)
             name = f"ours, {direction}"
             error = depth - scene.depth_mm
-            rows.append(Row(name, "depth", len(decoded.frames_used), threads, seconds, exact - scene.u, error))
+            rows.append(
+                Row(
+                    name,
+                    "depth",
+                    len(decoded.frames_used),
+                    threads,
+                    seconds,
+                    exact - scene.u,
+                    error,
+                )
+            )
     return rows
 
 
@@ -118,7 +138,9 @@ def run_fringes(scene: Scene, repeats: int) -> list[Row]:
     except ImportError:
         print("fringes is not installed (pip install 'fpp-ml-bench[benchmarks]'): left out")
         return []
-    logging.getLogger("fringes").setLevel(logging.ERROR)  # it warns on every call that one frequency is ambiguous
+    logging.getLogger("fringes").setLevel(
+        logging.ERROR
+    )  # it warns on every call that one frequency is ambiguous
     projector, rows = scene.rig.projector, []
     periods = max(projector.width, projector.height) / scene.rig.pitch_vertical_px
     coder = Fringes(X=projector.width, Y=projector.height)
@@ -127,16 +149,24 @@ def run_fringes(scene: Scene, repeats: int) -> list[Row]:
     coder.N = [[18, 7]] * 2
     stack = np.stack(scene.capture(list(coder.encode()[..., 0]), seed=2))
     for threads in sorted({1, os.cpu_count() or 1}):
-        seconds, decoded = timed(lambda threads=threads: coder.decode(stack, threads=threads), repeats)
+        seconds, decoded = timed(
+            lambda threads=threads: coder.decode(stack, threads=threads), repeats
+        )
         u, v = (decoded.x[i, ..., 0].astype(np.float64) for i in (0, 1))
         depth = depth_from_both(scene.rig.camera.rays(), u, v, scene.rig).depth_mm
         error = depth - scene.depth_mm
-        rows.append(Row("fringes, both", "coordinates", len(stack), threads, seconds, u - scene.u, error))
+        rows.append(
+            Row("fringes, both", "coordinates", len(stack), threads, seconds, u - scene.u, error)
+        )
     same = Fringes(X=projector.width, Y=projector.height)
     same.K = 1
     same.v, same.N = [[periods]] * 2, [[18]] * 2
     sequence = scene.rig.sequence
-    ours = [pattern_image(scene.rig, i) for d in ("vertical", "horizontal") for i in sequence.sinusoids(d)]
+    ours = [
+        pattern_image(scene.rig, i)
+        for d in ("vertical", "horizontal")
+        for i in sequence.sinusoids(d)
+    ]
     stack = np.stack(scene.capture(ours, seed=1))
     seconds, _ = timed(lambda: same.decode(stack, unwrap=False, threads=1), repeats)
     rows.append(Row("fringes, our sinusoids, both", "relative phase", len(stack), 1, seconds))
@@ -156,7 +186,9 @@ def run_opencv(scene: Scene, repeats: int) -> list[Row]:
 
     def sample() -> None:
         for index in pixels:
-            failed, pixel = code.getProjPixel(stack, int(index % rig.camera.width), int(index // rig.camera.width))
+            failed, pixel = code.getProjPixel(
+                stack, int(index % rig.camera.width), int(index // rig.camera.width)
+            )
             u[index], v[index] = (np.nan, np.nan) if failed else pixel
 
     seconds, _ = timed(sample, 1)
@@ -164,7 +196,17 @@ def run_opencv(scene: Scene, repeats: int) -> list[Row]:
     u, v = u.reshape(rig.camera.height, -1), v.reshape(rig.camera.height, -1)
     error = depth_from_both(rig.camera.rays(), u, v, rig).depth_mm - scene.depth_mm
     threads = cv2.getNumThreads()
-    rows = [Row("OpenCV Gray code, pixel by pixel *", "whole px", count, threads, seconds, u - scene.u, error)]
+    rows = [
+        Row(
+            "OpenCV Gray code, pixel by pixel *",
+            "whole px",
+            count,
+            threads,
+            seconds,
+            u - scene.u,
+            error,
+        )
+    ]
     twice = [np.stack(stack)] * 2
     dark, light = [images[-2]] * 2, [images[-1]] * 2
     seconds, _ = timed(lambda: code.decode(twice, None, dark, light), min(repeats, 3))
@@ -180,7 +222,9 @@ def run_opencv(scene: Scene, repeats: int) -> list[Row]:
 
     def unwrap() -> Any:
         wrapped, mask = sinusoid.computePhaseMap(three, shadowMask=lit)
-        return sinusoid.unwrapPhaseMap(wrapped, (rig.camera.width, rig.camera.height), shadowMask=mask)
+        return sinusoid.unwrapPhaseMap(
+            wrapped, (rig.camera.width, rig.camera.height), shadowMask=mask
+        )
 
     seconds, phase = timed(unwrap, min(repeats, 3))
     period = rig.pitch_vertical_px
@@ -215,17 +259,26 @@ def report(scene: Scene, rows: list[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--size", type=int, default=960, help="camera image width and height in px (default 960)")
-    parser.add_argument("--repeats", type=int, default=7, help="timed calls, of which the median counts (default 7)")
+    parser.add_argument(
+        "--size", type=int, default=960, help="camera image width and height in px (default 960)"
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=7, help="timed calls, of which the median counts (default 7)"
+    )
     args = parser.parse_args()
     if args.size < 240 or args.repeats < 1:
         parser.error("--size must be at least 240 (the peers' own limits) and --repeats at least 1")
     scene = make_scene(args.size)
     load = os.getloadavg()[0]
     print(
-        f"{args.size} x {args.size} px, median of {args.repeats}; {os.cpu_count()} cores, load at the start {load:.1f}"
+        f"{args.size} x {args.size} px, median of {args.repeats}; {os.cpu_count()} cores, load at "
+        f"the start {load:.1f}"
     )
-    rows = run_ours(scene, args.repeats) + run_fringes(scene, args.repeats) + run_opencv(scene, args.repeats)
+    rows = (
+        run_ours(scene, args.repeats)
+        + run_fringes(scene, args.repeats)
+        + run_opencv(scene, args.repeats)
+    )
     report(scene, rows)
 
 

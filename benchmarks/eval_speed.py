@@ -2,16 +2,16 @@
 
     python benchmarks/eval_speed.py [--size 960] [--samples 30] [--repeats 7]
 
-- ``fpp-eval PREDICTIONS DATASET --json FILE``: imports, reading, hashing, checking, all scores, intervals,
-  table and result file.
+- ``fpp-eval PREDICTIONS DATASET --json FILE``: imports, reading, hashing, checking, all scores,
+  intervals, table and result file.
 - `LOAD`: imports NumPy and loads the predictions and targets, nothing else.
-- `PLAIN`: what a careful user writes: loads the same files, checks shapes and values, and computes the six headline
-  scores with NumPy boolean masks in float64, averaged over samples.
+- `PLAIN`: what a careful user writes: loads the same files, checks shapes and values, and computes
+  the six headline scores with NumPy boolean masks in float64, averaged over samples.
 
-Both scripts read the targets as .npy files, which is faster than any dataset format. Each round runs all three, one
-after the other; times are medians over the rounds, wall time and processor time (the sum over all cores). The six
-scores of `PLAIN` are compared with those in the command's result file. The object covers a tenth of each image, as in
-the paper's test split.
+Both scripts read the targets as .npy files, which is faster than any dataset format. Each round
+runs all three, one after the other; times are medians over the rounds, wall time and processor time
+(the sum over all cores). The six scores of `PLAIN` are compared with those in the command's result
+file. The object covers a tenth of each image, as in the paper's test split.
 """
 
 import argparse
@@ -86,7 +86,8 @@ def depth_map(size: int, seed: int) -> NDArray[np.float32]:
 
 
 def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: int) -> None:
-    """Write a dataset of ``samples`` views, predictions with 2 mm of noise, and the targets as .npy."""
+    """Write a dataset of ``samples`` views, predictions with 2 mm of noise, and the targets as
+    .npy."""
     for path in (data, predictions, targets):
         path.mkdir(parents=True)
     names = [(f"{name}_{view}", name, view) for name in TEST_OBJECTS for view in VIEWS][:samples]
@@ -94,7 +95,9 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
     for sample in names:
         objects.setdefault(sample[1], []).append(sample)
     plans, receipts = plan_shards("test", objects), []
-    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), (size, size), "single_shot", exact=False)
+    manifest = Manifest(
+        "generated", {}, {}, paper_rig(960).to_dict(), (size, size), "single_shot", exact=False
+    )
     for number, plan in enumerate(plans):
         rows: list[Row] = []
         for sample, name, view in plan.samples:
@@ -109,28 +112,38 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
 
 
 def seconds(command: list[str], bytecode: Path) -> tuple[float, float, str]:
-    """Wall time, processor time and output of a whole process. Compiled modules are kept in ``bytecode``."""
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    """Wall time, processor time and output of a whole process. Compiled modules are kept in
+    ``bytecode``."""
+    environment = {
+        key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"
+    }
     environment["PYTHONPYCACHEPREFIX"] = str(bytecode)
     started, before = time.perf_counter(), os.times()
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=environment)
     after = os.times()
     wall = time.perf_counter() - started
-    used = after.children_user + after.children_system - before.children_user - before.children_system
+    used = (
+        after.children_user + after.children_system - before.children_user - before.children_system
+    )
     return wall, used, done.stdout.decode()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", type=int, default=960, help="image height and width in px")
     parser.add_argument("--samples", type=int, default=30, help="samples of the split, at most 30")
     parser.add_argument("--repeats", type=int, default=7, help="rounds")
     args = parser.parse_args()
     if not COMMAND.is_file():
-        sys.exit(f"expected the command fpp-eval at {COMMAND}; install the package into this environment")
+        sys.exit(
+            f"expected the command fpp-eval at {COMMAND}; install the package into this environment"
+        )
     with tempfile.TemporaryDirectory(prefix="eval-speed-") as folder:
         data, predictions, targets, result, bytecode = (
-            str(Path(folder) / name) for name in ("data", "predictions", "targets", "result.json", "bytecode")
+            str(Path(folder) / name)
+            for name in ("data", "predictions", "targets", "result.json", "bytecode")
         )
         prepare(Path(data), Path(predictions), Path(targets), args.size, args.samples)
         commands = {
@@ -138,20 +151,31 @@ def main() -> None:
             "load": [sys.executable, "-c", LOAD, predictions, targets],
             "plain": [sys.executable, "-c", PLAIN, predictions, targets],
         }
-        outputs = {name: seconds(command, Path(bytecode))[2] for name, command in commands.items()}  # warms up
+        outputs = {
+            name: seconds(command, Path(bytecode))[2] for name, command in commands.items()
+        }  # warms up
         rounds = [
-            {name: seconds(command, Path(bytecode)) for name, command in commands.items()} for _ in range(args.repeats)
+            {name: seconds(command, Path(bytecode)) for name, command in commands.items()}
+            for _ in range(args.repeats)
         ]
         metrics = json.loads(Path(result).read_text())["metrics"]
     wall, used = (
-        {name: statistics.median(times[name][kind] for times in rounds) for name in commands} for kind in (0, 1)
+        {name: statistics.median(times[name][kind] for times in rounds) for name in commands}
+        for kind in (0, 1)
     )
     print(f"{args.samples} samples of {args.size}x{args.size} px, median of {args.repeats} rounds")
-    print(f"fpp-eval, every check and score: {wall['fpp-eval']:.2f} s wall, {used['fpp-eval']:.2f} s processor")
-    for name, title in (("load", "only loading the same files"), ("plain", "the six headline scores in plain NumPy")):
+    print(
+        f"fpp-eval, every check and score: {wall['fpp-eval']:.2f} s wall, {used['fpp-eval']:.2f} s "
+        f"processor"
+    )
+    for name, title in (
+        ("load", "only loading the same files"),
+        ("plain", "the six headline scores in plain NumPy"),
+    ):
         print(
             f"{title}: {wall[name]:.2f} s wall, {used[name]:.2f} s processor; fpp-eval takes "
-            f"{wall['fpp-eval'] / wall[name]:.1f} times the wall time, {used['fpp-eval'] / used[name]:.1f} times the "
+            f"{wall['fpp-eval'] / wall[name]:.1f} times the wall time, "
+            f"{used['fpp-eval'] / used[name]:.1f} times the "
             "processor time"
         )
     plain = dict(zip(HEADLINE, json.loads(outputs["plain"]), strict=True))

@@ -1,11 +1,12 @@
-"""The examination on captures that are right: none may be refused or warned of, and how long it takes.
+"""The examination on captures that are right: none may be refused or warned of, and how long it
+takes.
 
     python benchmarks/examination.py [CAPTURES] [--size 240] [--keep FOLDER]
 
-Scenes by the renderer: three lights with 3 to 18 steps, and the light `paper` with each disturbance of FPP-C at every
-severity. CAPTURES: a folder with the captures of the public repository jakobwilm/slstudio, as for `real_captures.py`;
-they are examined as they are, mirrored, and in the opposite order, which has to be named. ``--keep``: where rendered
-frames are kept for the next run.
+Scenes by the renderer: three lights with 3 to 18 steps, and the light `paper` with each disturbance
+of FPP-C at every severity. CAPTURES: a folder with the captures of the public repository
+jakobwilm/slstudio, as for `real_captures.py`; they are examined as they are, mirrored, and in the
+opposite order, which has to be named. ``--keep``: where rendered frames are kept for the next run.
 """
 
 import argparse
@@ -33,14 +34,19 @@ from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
-STEPS, OBJECTS = (3, 4, 5, 6, 8, 12, 18), ("mug", "power_drill", "honeycomb", "wire_loop", "large_clamp", "gear")
+STEPS, OBJECTS = (
+    (3, 4, 5, 6, 8, 12, 18),
+    ("mug", "power_drill", "honeycomb", "wire_loop", "large_clamp", "gear"),
+)
 DISTURBED_STEPS, DISTURBED_OBJECTS = (3, 4, 18), ("mug", "power_drill")
 FAULTS = ("motion", "calibration-error")
 """Axes that are no light: a scene that moves and a calibration that is wrong are faults."""
 Scene = tuple[str, Rig, NDArray]
 
 
-def photographed(title: str, size: int, steps: int, light: Light, name: str, kept: Path | None) -> Scene:
+def photographed(
+    title: str, size: int, steps: int, light: Light, name: str, kept: Path | None
+) -> Scene:
     sequence = {"steps": steps, "bits_horizontal": 7, "bits_vertical": 7}
     rig = rig_from_dict({**paper_rig(size).to_dict(), "sequence": sequence})
     what = f"{title}, {steps} steps, {name}"
@@ -81,17 +87,31 @@ def real(folder: Path) -> Iterator[tuple[Scene, bool]]:
             yield (f"{name}, in the opposite order", rig, frames[::-1]), True
         rig = rig_of(theirs, "board", Path(scratch))
         for number in range(1, 7):
-            frames = read_frames(folder / "calibration" / f"calseq{number}", count=len(rig.sequence)).frames
+            frames = read_frames(
+                folder / "calibration" / f"calseq{number}", count=len(rig.sequence)
+            ).frames
             for calibrated in (True, False):
-                yield (f"calseq{number}, {'decoded' if calibrated else 'for calibration'}", rig, frames), calibrated
+                yield (
+                    (
+                        f"calseq{number}, {'decoded' if calibrated else 'for calibration'}",
+                        rig,
+                        frames,
+                    ),
+                    calibrated,
+                )
 
 
 def named(found: Examination) -> str:
-    return "; ".join(str(finding)[:160] for finding in found.findings if finding.severity != "note") or "nothing"
+    return (
+        "; ".join(str(finding)[:160] for finding in found.findings if finding.severity != "note")
+        or "nothing"
+    )
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("captures", nargs="?", type=Path, metavar="CAPTURES")
     parser.add_argument("--size", type=int, default=240, metavar="PX")
     parser.add_argument("--keep", type=Path, metavar="FOLDER")
@@ -107,7 +127,10 @@ def main() -> int:
         if says != "nothing":
             wrong += 1
             print(f"{title}: {says}", flush=True)
-    print(f"{count} scenes of {args.size} px: {wrong} refused or warned of; slowest examination {slowest:.2f} s")
+    print(
+        f"{count} scenes of {args.size} px: {wrong} refused or warned of; slowest examination "
+        f"{slowest:.2f} s"
+    )
     for (title, rig, frames), calibrated in real(args.captures) if args.captures else ():
         started = perf_counter()
         found = examine(frames, rig, calibrated=calibrated)

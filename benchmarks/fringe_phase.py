@@ -2,15 +2,17 @@
 
     python benchmarks/fringe_phase.py DATASET [--split validation] [--views 3] [--fringes horizontal] [--members 3]
 
-DATASET: 960 px, of any light; with crossed fringes (``--rig crossed``) for ``--fringes crossed``, where the two phases
-are those of the carriers. Printed for each method: the mean absolute error in rad of the object's pixels 3 px or more
-from depth edges and of those nearer, the median of all, and the share beyond 0.3 rad; pixels that are void count
-nowhere. The truth is the phase of the exact depth. Every method is given the true mask.
+DATASET: 960 px, of any light; with crossed fringes (``--rig crossed``) for ``--fringes crossed``,
+where the two phases are those of the carriers. Printed for each method: the mean absolute error in
+rad of the object's pixels 3 px or more from depth edges and of those nearer, the median of all, and
+the share beyond 0.3 rad; pixels that are void count nowhere. The truth is the phase of the exact
+depth. Every method is given the true mask.
 
-``local fit`` is that of ``phase`` (one direction) or ``crossed``. ``Fourier`` is Takeda's: the half-plane around the
-carrier under a Hann window (Takeda et al., JOSA 72:156, 1982). ``windowed Fourier`` filters under a Gaussian of 0.9
-periods around frequencies near the carrier's, and drops what is below six sigmas of the noise (Kemao, Optics and Lasers
-in Engineering 45:304, 2007); of four windows and spreads tried on validation views, this has the least error.
+``local fit`` is that of ``phase`` (one direction) or ``crossed``. ``Fourier`` is Takeda's: the
+half-plane around the carrier under a Hann window (Takeda et al., JOSA 72:156, 1982). ``windowed
+Fourier`` filters under a Gaussian of 0.9 periods around frequencies near the carrier's, and drops
+what is below six sigmas of the noise (Kemao, Optics and Lasers in Engineering 45:304, 2007); of
+four windows and spreads tried on validation views, this has the least error.
 """
 
 import argparse
@@ -37,15 +39,17 @@ from fpp_ml_bench.tables import Table
 FAR_RAD = 0.3
 BAND = 0.6  # half width of Takeda's window, as a share of the carrier's frequency
 WINDOW_PERIODS, SPREAD, STEPS, SIGMAS = 0.9, 0.35, 5, 6.0
-"""Of the windowed Fourier filter: its Gaussian in periods, how far its frequencies go, as a share of the carrier's, in
-how many steps along each axis, and the threshold in sigmas of the noise."""
+"""Of the windowed Fourier filter: its Gaussian in periods, how far its frequencies go, as a share
+of the carrier's, in how many steps along each axis, and the threshold in sigmas of the noise."""
 
 
 def fourier(grey: NDArray, step_rad: NDArray, noise_grey: float) -> NDArray:
     """Takeda's phase (H, W) of the carrier that advances by ``step_rad`` along x and y."""
     frequencies = np.meshgrid(*(fft.fftfreq(length) for length in grey.shape[::-1]))
     centre = step_rad / TAU
-    apart = np.hypot(frequencies[0] - centre[0], frequencies[1] - centre[1]) / (BAND * np.hypot(*centre))
+    apart = np.hypot(frequencies[0] - centre[0], frequencies[1] - centre[1]) / (
+        BAND * np.hypot(*centre)
+    )
     window = np.where(apart < 1, 0.5 + 0.5 * np.cos(np.pi * np.minimum(apart, 1)), 0)
     return np.angle(fft.ifft2(fft.fft2(grey - grey.mean()) * window))
 
@@ -53,7 +57,9 @@ def fourier(grey: NDArray, step_rad: NDArray, noise_grey: float) -> NDArray:
 def windowed_fourier(grey: NDArray, step_rad: NDArray, noise_grey: float) -> NDArray:
     """Kemao's windowed Fourier filter."""
     spectrum = fft.fft2(grey - grey.mean())
-    frequencies = [TAU * axis for axis in np.meshgrid(*(fft.fftfreq(length) for length in grey.shape[::-1]))]
+    frequencies = [
+        TAU * axis for axis in np.meshgrid(*(fft.fftfreq(length) for length in grey.shape[::-1]))
+    ]
     reach, window_px = SPREAD * np.hypot(*step_rad), WINDOW_PERIODS * TAU / np.hypot(*step_rad)
     total = np.zeros(grey.shape, np.complex128)
     # Noise of a coefficient of the window of unit energy.
@@ -77,7 +83,12 @@ def learned_phases(method: FringeNetMethod, seen: Observation | CrossedObservati
 
 
 def phases(
-    dataset: DatasetFolder, sample: str, fringes: str, methods: dict[str, Any], inside: NDArray, exact: NDArray
+    dataset: DatasetFolder,
+    sample: str,
+    fringes: str,
+    methods: dict[str, Any],
+    inside: NDArray,
+    exact: NDArray,
 ) -> tuple[NDArray, dict[str, NDArray]]:
     """True wrapped phases (K, H, W), and those of each method."""
     measured = methods["local fit"]
@@ -99,9 +110,14 @@ def phases(
         local[0][seen.crop] = seen.phase_rad
     found["local fit"] = local
     grey = frame.astype(np.float64)
-    transforms: dict[str, Callable[..., NDArray]] = {"Fourier": fourier, "windowed Fourier": windowed_fourier}
+    transforms: dict[str, Callable[..., NDArray]] = {
+        "Fourier": fourier,
+        "windowed Fourier": windowed_fourier,
+    }
     for name, transform in transforms.items():
-        found[name] = np.stack([transform(grey, step, seen.background.noise_grey) for step in steps])
+        found[name] = np.stack(
+            [transform(grey, step, seen.background.noise_grey) for step in steps]
+        )
     for name, method in methods.items():
         if name == "local fit":
             continue
@@ -112,13 +128,21 @@ def phases(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("dataset", type=DatasetFolder)
     parser.add_argument("--split", default="validation")
     parser.add_argument("--views", type=int, default=3, help="of each object (default: 3)")
-    parser.add_argument("--fringes", choices=("horizontal", "vertical", "crossed"), default="horizontal")
-    parser.add_argument("--members", type=int, default=3, help="of fringe-net, 0 for without (default: 3)")
-    parser.add_argument("--weights", action="append", default=[], help="of one network of fringe-net, another line")
+    parser.add_argument(
+        "--fringes", choices=("horizontal", "vertical", "crossed"), default="horizontal"
+    )
+    parser.add_argument(
+        "--members", type=int, default=3, help="of fringe-net, 0 for without (default: 3)"
+    )
+    parser.add_argument(
+        "--weights", action="append", default=[], help="of one network of fringe-net, another line"
+    )
     given = parser.parse_args()
     dataset: DatasetFolder = given.dataset
     if given.fringes == "crossed":
@@ -126,12 +150,19 @@ def main() -> int:
     else:
         methods = {"local fit": load_method("phase", dataset, direction=given.fringes)}
     for count in sorted({1, given.members} - {0}) if given.members else ():
-        methods[f"fringe-net, {count}"] = load_method("fringe-net", dataset, fringes=given.fringes, members=count)
+        methods[f"fringe-net, {count}"] = load_method(
+            "fringe-net", dataset, fringes=given.fringes, members=count
+        )
     for weights in given.weights:
-        methods[weights] = load_method("fringe-net", dataset, fringes=given.fringes, weights=weights)
+        methods[weights] = load_method(
+            "fringe-net", dataset, fringes=given.fringes, weights=weights
+        )
     names = dataset.samples(given.split)
     owners = {name: name.rpartition("_")[0] for name in names}
-    of_object = [[name for name in names if owners[name] == owner] for owner in dict.fromkeys(owners.values())]
+    of_object = [
+        [name for name in names if owners[name] == owner]
+        for owner in dict.fromkeys(owners.values())
+    ]
     samples = [name for views in of_object for name in views[: given.views]]
     rows: dict[str, list[list[float]]] = {}
     for sample in samples:
@@ -143,12 +174,20 @@ def main() -> int:
             error = np.abs(wrapped(phase - truth)).mean(axis=0)
             edge, inner = error[inside & ~void & near], error[inside & ~void & ~near]
             both = np.concatenate([edge, inner])
-            means = [inner.mean(), edge.mean() if edge.size else np.nan, np.median(both), 100 * (both > FAR_RAD).mean()]
+            means = [
+                inner.mean(),
+                edge.mean() if edge.size else np.nan,
+                np.median(both),
+                100 * (both > FAR_RAD).mean(),
+            ]
             rows.setdefault(name, []).append([float(value) for value in means])
     titles = "Interior, rad", "Edge, rad", "Median, rad", f"Beyond {FAR_RAD} rad, %"
     means = {name: np.nanmean(each, axis=0) for name, each in rows.items()}
     cells = [
-        {"Phase": name, **{title: f"{value:.3f}" for title, value in zip(titles, each, strict=True)}}
+        {
+            "Phase": name,
+            **{title: f"{value:.3f}" for title, value in zip(titles, each, strict=True)},
+        }
         for name, each in means.items()
     ]
     for line in Table.of(f"{dataset.path}, {given.split}, {len(samples)} views", cells).markdown():

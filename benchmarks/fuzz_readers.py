@@ -1,5 +1,5 @@
-"""Mutations of valid files of every kind that comes from outside: how many are read, refused by an error that names
-the file, and broke the reader, with the first few of these.
+"""Mutations of valid files of every kind that comes from outside: how many are read, refused by an
+error that names the file, and broke the reader, with the first few of these.
 
     python benchmarks/fuzz_readers.py [--mutations 2000] [--seed 0] [READER ...]
 
@@ -34,7 +34,9 @@ def tree_outcomes(folder: Path, count: int, seed: int) -> Iterable[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mutations", type=int, default=2000, help="of each reader's file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("readers", nargs="*", metavar="READER", help="default: all")

@@ -1,22 +1,26 @@
-"""Is the light right? Our images against a path tracer's, Mitsuba 3, of the same scenes; our camera against `fringes`.
+"""Is the light right? Our images against a path tracer's, Mitsuba 3, of the same scenes; our camera
+against `fringes`.
 
     python benchmarks/path_traced.py [--scenes plane,bowl] [--size 240] [--pictures DIR]
 
-Each scene stands before the background plane in the paper's rig, lit by the projector with shadows, no other lamp and
-no noise. Both renderers give the light of white and of the 18 horizontal fringes, direct (path length 2) and with every
-further bounce. Grey levels are absolute: Mitsuba's projector has the power that ours has, and no factor is fitted. One
-image of Mitsuba carries white and the fringes' first harmonic as its three channels, from which all 18 frames' phase
-follows, because light is linear in the pattern. Pixels inside the object count: none whose rays see different surfaces,
-and none beside those. Mitsuba renders each image twice, with two seeds; the mean of both is compared, and "seeds" is
-how far they differ. A mean grey level is that of the image in question.
+Each scene stands before the background plane in the paper's rig, lit by the projector with shadows,
+no other lamp and no noise. Both renderers give the light of white and of the 18 horizontal fringes,
+direct (path length 2) and with every further bounce. Grey levels are absolute: Mitsuba's projector
+has the power that ours has, and no factor is fitted. One image of Mitsuba carries white and the
+fringes' first harmonic as its three channels, from which all 18 frames' phase follows, because
+light is linear in the pattern. Pixels inside the object count: none whose rays see different
+surfaces, and none beside those. Mitsuba renders each image twice, with two seeds; the mean of both
+is compared, and "seeds" is how far they differ. A mean grey level is that of the image in question.
 
 - direct: RMS difference within 1% of the mean grey level; matte, and glossy (on ``GLOSSY``)
 - with all bounces: within 3%, and the seeds within 1%
-- phase error: phase with all bounces minus phase of direct light, each renderer's own, where bounced light is at least
-  5% of the direct light and direct light at least 5% of its mean. Two figures, relative to Mitsuba's RMS: how far the
-  two RMS are apart, and the RMS of the difference pixel by pixel. Each within 20%, or within a milliradian.
+- phase error: phase with all bounces minus phase of direct light, each renderer's own, where
+  bounced light is at least 5% of the direct light and direct light at least 5% of its mean. Two
+  figures, relative to Mitsuba's RMS: how far the two RMS are apart, and the RMS of the difference
+  pixel by pixel. Each within 20%, or within a milliradian.
 
-Seconds are of one core. Exit status 1 if an agreement is missed. Needs ``pip install 'fpp-ml-bench[pathtrace]'``.
+Seconds are of one core. Exit status 1 if an agreement is missed. Needs ``pip install
+'fpp-ml-bench[pathtrace]'``.
 """
 
 import argparse
@@ -52,7 +56,8 @@ GLOSSY = ("plane", "sphere")
 GLOSS, ROUGHNESS = 0.3, 0.4
 DIRECT, ALL, PHASE, PHASE_RAD, SEEDS = 0.01, 0.03, 0.2, 1e-3, 0.01
 BOUNCES = 12
-"""Path length of "all bounces": 0.8 of the light is left by each, times the share that meets the object again."""
+"""Path length of "all bounces": 0.8 of the light is left by each, times the share that meets the
+object again."""
 DIRECT_SAMPLES = 256
 SAMPLES = {"bowl": 1296}
 """Paths a pixel with all bounces where 1024 are too few for the seeds to agree."""
@@ -60,7 +65,8 @@ SAMPLES = {"bowl": 1296}
 
 @dataclass(frozen=True)
 class Images:
-    """Light in grey levels: ``white`` float64 (H, W), and ``harmonic`` complex (H, W), the first of the 18 frames."""
+    """Light in grey levels: ``white`` float64 (H, W), and ``harmonic`` complex (H, W), the first of
+    the 18 frames."""
 
     white: NDArray[np.float64]
     harmonic: NDArray[np.complex128]
@@ -68,18 +74,22 @@ class Images:
 
     @classmethod
     def mean(cls, a: "Images", b: "Images") -> "Images":
-        return cls((a.white + b.white) / 2, (a.harmonic + b.harmonic) / 2, (a.seconds + b.seconds) / 2)
+        return cls(
+            (a.white + b.white) / 2, (a.harmonic + b.harmonic) / 2, (a.seconds + b.seconds) / 2
+        )
 
 
 def first_harmonic(frames: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """2/N sum I_k exp(-2 pi i k / N) of N frames along the first axis; its angle is the N-step phase."""
+    """2/N sum I_k exp(-2 pi i k / N) of N frames along the first axis; its angle is the N-step
+    phase."""
     steps = len(frames)
     weights = 2 / steps * np.exp(-2j * np.pi * np.arange(steps) / steps)
     return np.tensordot(weights, frames, axes=1)
 
 
 class PathTraced:
-    """A scene in the path tracer: the same mesh in the same place, before the same plane, lit by the same projector."""
+    """A scene in the path tracer: the same mesh in the same place, before the same plane, lit by
+    the same projector."""
 
     def __init__(self, mi: Any, mesh: SolidMesh, rig: Rig, light: Light, folder: Path) -> None:
         self.mi, self.rig, self.light = mi, rig, light
@@ -92,9 +102,13 @@ class PathTraced:
         self.width, self.height = int(u.max()) + 3 - self.left, int(v.max()) + 3 - self.top
 
     def render(self, length: int, samples: int, seed: int) -> Images:
-        """Light by paths of up to ``length`` pieces from the camera, ``samples`` a pixel; 0 beside the object's box."""
+        """Light by paths of up to ``length`` pieces from the camera, ``samples`` a pixel; 0 beside
+        the object's box."""
         start = time.process_time()
-        pixels = np.array(self.mi.render(self.mi.load_dict(self._scene(length, samples)), seed=seed), dtype=np.float64)
+        pixels = np.array(
+            self.mi.render(self.mi.load_dict(self._scene(length, samples)), seed=seed),
+            dtype=np.float64,
+        )
         seconds = time.process_time() - start
         whole = np.zeros((self.rig.camera.height, self.rig.camera.width, 3))
         whole[self.top : self.top + self.height, self.left : self.left + self.width] = pixels
@@ -104,17 +118,33 @@ class PathTraced:
     def _scene(self, length: int, samples: int) -> dict[str, Any]:
         rig, surface, camera = self.rig, self.light.surface, self.rig.camera
         projector = rig.projector
-        row = first_harmonic(np.array(pattern_profiles(rig))[list(rig.sequence.sinusoids("horizontal"))] / 255.0)
+        row = first_harmonic(
+            np.array(pattern_profiles(rig))[list(rig.sequence.sinusoids("horizontal"))] / 255.0
+        )
         row = row[: projector.height]
-        channels = np.stack([np.ones_like(row.real), (1 + row.real) / 2, (1 + row.imag) / 2], axis=1)
+        channels = np.stack(
+            [np.ones_like(row.real), (1 + row.real) / 2, (1 + row.imag) / 2], axis=1
+        )
         screen = np.repeat(channels[:, None], projector.width, axis=1).astype(np.float32)
         centre = projector_centre_m(rig)
-        # Mitsuba multiplies by pi, so a white surface that faces the lamp at 1 m has radiance `scale`.
+        # Mitsuba multiplies by pi, so a white surface that faces the lamp at 1 m has radiance
+        # `scale`.
         power = grey_of_white(self.light) * (rig.working_range_mm[0] / 1000) ** 2
-        matte: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": surface.albedo}}
-        mirror = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": surface.roughness**2}
+        matte: dict[str, Any] = {
+            "type": "diffuse",
+            "reflectance": {"type": "rgb", "value": surface.albedo},
+        }
+        mirror = {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "ggx",
+            "alpha": surface.roughness**2,
+        }
         blend = {"type": "blendbsdf", "weight": surface.gloss, "matte": matte, "mirror": mirror}
-        wall = {"type": "diffuse", "reflectance": {"type": "rgb", "value": (1 - surface.gloss) * surface.albedo}}
+        wall = {
+            "type": "diffuse",
+            "reflectance": {"type": "rgb", "value": (1 - surface.gloss) * surface.albedo},
+        }
         film = {
             "type": "hdrfilm",
             "width": camera.width,
@@ -145,7 +175,12 @@ class PathTraced:
                 "fov": _field_degrees(projector),
                 "scale": power,
                 "to_world": self._looking(centre),
-                "irradiance": {"type": "bitmap", "bitmap": self.mi.Bitmap(screen), "raw": True, "wrap_mode": "clamp"},
+                "irradiance": {
+                    "type": "bitmap",
+                    "bitmap": self.mi.Bitmap(screen),
+                    "raw": True,
+                    "wrap_mode": "clamp",
+                },
             },
             "object": {
                 "type": "ply",
@@ -156,13 +191,17 @@ class PathTraced:
             "wall": {
                 "type": "rectangle",
                 "bsdf": {"type": "twosided", "surface": wall},
-                "to_world": self.mi.ScalarTransform4f().translate([0, 0, rig.background_m]).scale([20, 20, 1]),
+                "to_world": self.mi.ScalarTransform4f()
+                .translate([0, 0, rig.background_m])
+                .scale([20, 20, 1]),
             },
         }
 
     def _looking(self, origin: NDArray[np.float64]) -> Any:
         target = origin + np.array([0.0, 0.0, 1.0])
-        return self.mi.ScalarTransform4f().look_at(origin=origin.tolist(), target=target.tolist(), up=[0, -1, 0])
+        return self.mi.ScalarTransform4f().look_at(
+            origin=origin.tolist(), target=target.tolist(), up=[0, -1, 0]
+        )
 
 
 def _field_degrees(pinhole: Any) -> float:
@@ -171,7 +210,8 @@ def _field_degrees(pinhole: Any) -> float:
 
 @dataclass(frozen=True)
 class Row:
-    """One agreement: relative or in radians, as ``asked`` is. ``seeds``: how far Mitsuba's two images differ."""
+    """One agreement: relative or in radians, as ``asked`` is. ``seeds``: how far Mitsuba's two
+    images differ."""
 
     scene: str
     what: str
@@ -187,35 +227,49 @@ class Row:
 
 
 def mesh_of(name: str) -> SolidMesh:
-    """A scene's object in object coordinates, metres: a tilted plate, a ball, or one of the benchmark's."""
+    """A scene's object in object coordinates, metres: a tilted plate, a ball, or one of the
+    benchmark's."""
     if name == "plane":
         y, z, tilt = 0.15, 0.15, np.radians(25)
         corners = np.array(
-            [[s * y * np.sin(tilt), s * y * np.cos(tilt), t * z] for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+            [
+                [s * y * np.sin(tilt), s * y * np.cos(tilt), t * z]
+                for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+            ]
         )
         return SolidMesh(name, corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     if name == "sphere":
         ball = trimesh.creation.icosphere(subdivisions=8, radius=0.13)
-        return SolidMesh(name, np.asarray(ball.vertices, dtype=np.float64), np.asarray(ball.faces, dtype=np.int32))
+        return SolidMesh(
+            name,
+            np.asarray(ball.vertices, dtype=np.float64),
+            np.asarray(ball.faces, dtype=np.int32),
+        )
     return benchmark_mesh(name)
 
 
 def light_of(bounces: bool, gloss: float = 0.0) -> Light:
-    """The paper's light with shadows and an even screen, as Mitsuba's projector has it, and no other lamp."""
+    """The paper's light with shadows and an even screen, as Mitsuba's projector has it, and no
+    other lamp."""
     light = named_light("paper").changed(ambient_grey=0.0).changed("projector", falloff=-3)
-    light = light.changed("surface", gloss=gloss, roughness=ROUGHNESS).changed("camera", rays_across=8)
+    light = light.changed("surface", gloss=gloss, roughness=ROUGHNESS).changed(
+        "camera", rays_across=8
+    )
     return light.changed("bounces", shadows=True, interreflection=bounces, ambient_occlusion=False)
 
 
 def ours(mesh: SolidMesh, rig: Rig, light: Light) -> tuple[Images, NDArray[np.bool_]]:
-    """Our images, and which pixels lie inside the object; the time is that of a second view of the same object."""
+    """Our images, and which pixels lie inside the object; the time is that of a second view of the
+    same object."""
     studio = Studio(BuildSettings(rig=rig, objects=("bowl",), light=light))
     studio.trace(mesh, "A0")
     frames = (rig.sequence.white, *rig.sequence.sinusoids("horizontal"))
     start = time.process_time()
     scene = studio.trace(mesh, "A0")
     image = np.empty((len(frames), rig.camera.height * rig.camera.width), dtype=np.float32)
-    studio.exposure.radiance(frames, studio.lighting.behind(scene.traced, scene.hits.pixels), scene.stream, image)
+    studio.exposure.radiance(
+        frames, studio.lighting.behind(scene.traced, scene.hits.pixels), scene.stream, image
+    )
     parts = [(scene.hits.pixels, scene.lit)]
     if scene.mixed is not None and scene.mixed_lit is not None:
         parts.append((scene.mixed.pixels, scene.mixed_lit))
@@ -237,32 +291,53 @@ def root_mean_square(values: NDArray[Any]) -> float:
     return float(np.sqrt(np.mean(np.abs(values) ** 2)))
 
 
-def image_rows(scene: str, what: str, own: Images, a: Images, b: Images, inside: NDArray, asked: float) -> list[Row]:
-    """Agreement of white, and of a fringe image (frame 0 or a quarter of a period later, the worse of the two)."""
+def image_rows(
+    scene: str, what: str, own: Images, a: Images, b: Images, inside: NDArray, asked: float
+) -> list[Row]:
+    """Agreement of white, and of a fringe image (frame 0 or a quarter of a period later, the worse
+    of the two)."""
     rows = []
     level = own.white[inside].mean()
     fields = {
         "white": [lambda i: i.white],
-        "fringes": [lambda i: (i.white + i.harmonic.real) / 2, lambda i: (i.white + i.harmonic.imag) / 2],
+        "fringes": [
+            lambda i: (i.white + i.harmonic.real) / 2,
+            lambda i: (i.white + i.harmonic.imag) / 2,
+        ],
     }
     for name, parts in fields.items():
         worst = seeds = 0.0
         for part in parts:
             mean = level if name == "white" else part(own)[inside].mean()
-            worst = max(worst, root_mean_square((part(own) - part(Images.mean(a, b)))[inside]) / mean)
+            worst = max(
+                worst, root_mean_square((part(own) - part(Images.mean(a, b)))[inside]) / mean
+            )
             seeds = max(seeds, root_mean_square((part(a) - part(b))[inside]) / mean)
-        rows.append(Row(scene, f"{what}, {name}", worst, seeds, asked, own.seconds, (a.seconds + b.seconds) / 2))
+        rows.append(
+            Row(
+                scene,
+                f"{what}, {name}",
+                worst,
+                seeds,
+                asked,
+                own.seconds,
+                (a.seconds + b.seconds) / 2,
+            )
+        )
     return rows
 
 
 def phase_rows(
     scene: str, own: tuple[Images, Images], a: Images, b: Images, direct: Images, inside: NDArray
 ) -> list[Row]:
-    """The size of the phase error, and the difference pixel by pixel, which Mitsuba's noise and ours are part of."""
+    """The size of the phase error, and the difference pixel by pixel, which Mitsuba's noise and
+    ours are part of."""
     mine, lit = own
     other = Images.mean(a, b)
     least = 0.05 * direct.white[inside].mean()
-    chosen = inside & (direct.white > least) & (lit.white > least) & (other.white > 1.05 * direct.white)
+    chosen = (
+        inside & (direct.white > least) & (lit.white > least) & (other.white > 1.05 * direct.white)
+    )
     if not chosen.any():
         return []
     error = _phase(mine, lit)[chosen], _phase(other, direct)[chosen]
@@ -273,7 +348,14 @@ def phase_rows(
     apart, asked = abs(root_mean_square(error[0]) - size), max(PHASE, PHASE_RAD / size)
     return [
         Row(scene, f"{what}: its RMS", apart / size, seeds / size, asked, *seconds),
-        Row(scene, f"{what}: by pixel", root_mean_square(error[0] - error[1]) / size, seeds / size, asked, *seconds),
+        Row(
+            scene,
+            f"{what}: by pixel",
+            root_mean_square(error[0] - error[1]) / size,
+            seeds / size,
+            asked,
+            *seconds,
+        ),
     ]
 
 
@@ -282,11 +364,15 @@ def _phase(image: Images, direct: Images) -> NDArray[np.float64]:
 
 
 def camera_rows() -> list[str]:
-    """Mean and standard deviation of our camera's grey levels beside those of `fringes.util.fade`, and its blur."""
+    """Mean and standard deviation of our camera's grey levels beside those of `fringes.util.fade`,
+    and its blur."""
     try:
         from fringes.util import fade
     except ImportError:
-        return ["fringes is not installed (pip install 'fpp-ml-bench[benchmarks]'): its camera is left out"]
+        return [
+            "fringes is not installed (pip install 'fpp-ml-bench[benchmarks]'): its camera is left "
+            "out"
+        ]
     camera = named_light("paper").camera
     electrons = camera.full_well_e or np.inf
     sensor, gain = Sensor.of(camera), 255 / electrons
@@ -301,18 +387,27 @@ def camera_rows() -> list[str]:
             stream_keys("fade", grey)[None],
             sensor,
         )
-        # `fade` cuts off decimals where ours rounds: half a grey level of dark current makes the two one.
+        # `fade` cuts off decimals where ours rounds: half a grey level of dark current makes the
+        # two one.
         image = np.full((1, 1, pixels.size, 1), grey / 255)
         other = fade(image, K=gain, dark_noise=camera.read_noise_e, dark_current=0.5 / gain, rng=1)
         lines.append(
             f"camera at grey {grey:g}: ours {own.mean():.3f} +- {own.std():.4f}, "
             f"fringes {other.mean():.3f} +- {other.std():.4f}"
         )
-    edge = np.where(np.arange(64) < 32, np.float32(40), np.float32(200)) + np.zeros((64, 1), dtype=np.float32)
+    edge = np.where(np.arange(64) < 32, np.float32(40), np.float32(200)) + np.zeros(
+        (64, 1), dtype=np.float32
+    )
     own_edge = edge.copy()
     blur_image(own_edge, gaussian_weights(1.2**2, 3.0).astype(np.float32), np.empty_like(edge))
-    apart = np.abs(own_edge - gaussian_filter(edge.astype(float), 1.2, mode="nearest")).max()  # what `fade` calls
-    return [*lines, f"lens blur of an edge of 160 grey levels, sigma 1.2 px: at most {apart:.3f} grey levels apart"]
+    apart = np.abs(
+        own_edge - gaussian_filter(edge.astype(float), 1.2, mode="nearest")
+    ).max()  # what `fade` calls
+    return [
+        *lines,
+        f"lens blur of an edge of 160 grey levels, sigma 1.2 px: at most {apart:.3f} grey levels "
+        f"apart",
+    ]
 
 
 def compare(mi: Any, name: str, args: argparse.Namespace, folder: Path) -> list[Row]:
@@ -326,7 +421,9 @@ def compare(mi: Any, name: str, args: argparse.Namespace, folder: Path) -> list[
     start = time.process_time()
     surfels = Surfels.of(mesh)
     print(
-        f"{name}: {len(surfels.grid.area_m2)} surfels, {time.process_time() - start:.2f} s once an object", flush=True
+        f"{name}: {len(surfels.grid.area_m2)} surfels, {time.process_time() - start:.2f} s once an "
+        f"object",
+        flush=True,
     )
     rows = []
     own_direct, inside = ours(mesh, rig, light_of(False))
@@ -339,7 +436,12 @@ def compare(mi: Any, name: str, args: argparse.Namespace, folder: Path) -> list[
     if name in GLOSSY:
         light = light_of(False, GLOSS)
         rows += image_rows(
-            name, "glossy", ours(mesh, rig, light)[0], *path_traced(light, 2, DIRECT_SAMPLES), inside, DIRECT
+            name,
+            "glossy",
+            ours(mesh, rig, light)[0],
+            *path_traced(light, 2, DIRECT_SAMPLES),
+            inside,
+            DIRECT,
         )
     if args.pictures:
         picture(name, own, Images.mean(*full), inside, args.pictures / f"path_traced_{name}.png")
@@ -368,7 +470,10 @@ def picture(name: str, own: Images, other: Images, inside: NDArray, file: Path) 
 
 
 def table(rows: list[Row]) -> str:
-    lines = ["| scene | what | difference | seeds | asked | ours s | Mitsuba s |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| scene | what | difference | seeds | asked | ours s | Mitsuba s |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for row in rows:
         asked = f"{row.asked:.1%}{'' if row.kept else ' **missed**'}"
         lines.append(
@@ -379,10 +484,18 @@ def table(rows: list[Row]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", default=",".join(SCENES), help=f"of {', '.join(SCENES)}, or other objects")
-    parser.add_argument("--size", type=int, default=240, metavar="PX", help="image size (default: 240)")
-    parser.add_argument("--samples", type=int, help="Mitsuba's paths a pixel with all bounces (default: by scene)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scenes", default=",".join(SCENES), help=f"of {', '.join(SCENES)}, or other objects"
+    )
+    parser.add_argument(
+        "--size", type=int, default=240, metavar="PX", help="image size (default: 240)"
+    )
+    parser.add_argument(
+        "--samples", type=int, help="Mitsuba's paths a pixel with all bounces (default: by scene)"
+    )
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write side-by-side pictures")
     args = parser.parse_args()
     try:
@@ -397,11 +510,17 @@ def main() -> int:
     print(table(rows))
     noisy = [row.scene for row in rows if row.what.startswith("all bounces") and row.seeds > SEEDS]
     if noisy:
-        print(f"seeds differ by more than {SEEDS:.0%}, take more samples: {', '.join(sorted(set(noisy)))}")
+        print(
+            f"seeds differ by more than {SEEDS:.0%}, take more samples: "
+            f"{', '.join(sorted(set(noisy)))}"
+        )
     bounced = [row for row in rows if row.what == "all bounces, white"]
     # Ours is all of white and 18 fringes, Mitsuba's one image of three channels.
     ratio = np.median([19 / 3 * row.mitsuba_s / row.ours_s for row in bounced])
-    print(f"a frame with all bounces: ours is {np.log10(ratio):.1f} orders of magnitude faster (median of scenes)")
+    print(
+        f"a frame with all bounces: ours is {np.log10(ratio):.1f} orders of magnitude faster "
+        f"(median of scenes)"
+    )
     print("\n".join(camera_rows()))
     return 0 if all(row.kept for row in rows) and not noisy else 1
 

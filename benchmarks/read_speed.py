@@ -1,12 +1,14 @@
-"""Reading frame 0 and depth as float32 batches: PNG + .mat, plain ``datasets``, and our loader, in the same run.
+"""Reading frame 0 and depth as float32 batches: PNG + .mat, plain ``datasets``, and our loader, in
+the same run.
 
     python benchmarks/read_speed.py [--size 960] [--objects 4] [--batch 4] [--repeats 7]
 
-All readers give the same numbers (checked): fringe and depth float32 (B, 1, H, W), grey levels (ours: divided by 255 at
-no extra charge) and mm. The files are in the page cache; one process, one thread. Plain ``datasets`` is
-``load_dataset(FOLDER, "single_shot")`` in torch format with ``dtype=torch.float32``, reading the two columns only.
-Medians over repeats of reading every row once. "The copies alone" is the lower bound for any loader: the two images of
-each row copied from the memory map into a reused batch.
+All readers give the same numbers (checked): fringe and depth float32 (B, 1, H, W), grey levels
+(ours: divided by 255 at no extra charge) and mm. The files are in the page cache; one process, one
+thread. Plain ``datasets`` is ``load_dataset(FOLDER, "single_shot")`` in torch format with
+``dtype=torch.float32``, reading the two columns only. Medians over repeats of reading every row
+once. "The copies alone" is the lower bound for any loader: the two images of each row copied from
+the memory map into a reused batch.
 """
 
 import argparse
@@ -41,10 +43,14 @@ def write_png_mat(stored: DatasetFolder, samples: list[str], folder: Path) -> No
 
     for sample in samples:
         cv2.imwrite(str(folder / f"{sample}.png"), stored.frame(sample, 0))
-        scipy.io.savemat(folder / f"{sample}.mat", {"depthMap": stored.depth_mm(sample)}, do_compression=True)
+        scipy.io.savemat(
+            folder / f"{sample}.mat", {"depthMap": stored.depth_mm(sample)}, do_compression=True
+        )
 
 
-def read_png_mat(samples: list[str], folder: Path, batch: int, size: tuple[int, int]) -> Iterator[Batch]:
+def read_png_mat(
+    samples: list[str], folder: Path, batch: int, size: tuple[int, int]
+) -> Iterator[Batch]:
     import cv2
     import scipy.io
 
@@ -59,9 +65,13 @@ def read_png_mat(samples: list[str], folder: Path, batch: int, size: tuple[int, 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", type=int, default=960)
-    parser.add_argument("--objects", type=int, default=4, help="objects, six rows each (default: 4, one shard)")
+    parser.add_argument(
+        "--objects", type=int, default=4, help="objects, six rows each (default: 4, one shard)"
+    )
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=7)
     args = parser.parse_args()
@@ -83,7 +93,11 @@ def compare(scratch: Path, args: argparse.Namespace) -> None:
     datasets.disable_progress_bars()
     names = [name for name in OBJECTS if name not in ("mustard_bottle", "mug")][: args.objects]
     folder = scratch / "dataset"
-    build(folder, BuildSettings(rig=paper_rig(args.size), objects=tuple(names), stored="single_shot"), 1)
+    build(
+        folder,
+        BuildSettings(rig=paper_rig(args.size), objects=tuple(names), stored="single_shot"),
+        1,
+    )
     stored = DatasetFolder(folder)
     samples = stored.samples("train")
     files = scratch / "files"
@@ -115,7 +129,12 @@ def compare(scratch: Path, args: argparse.Namespace) -> None:
                 yield fringe_out, depth_out
 
     readers: list[tuple[str, Callable[[], Iterator[Batch]], float, int]] = [
-        ("PNG + .mat (cv2, scipy)", lambda: read_png_mat(samples, files, args.batch, stored.size), 1, 1),
+        (
+            "PNG + .mat (cv2, scipy)",
+            lambda: read_png_mat(samples, files, args.batch, stored.size),
+            1,
+            1,
+        ),
         ("plain datasets, torch format", through_datasets, 1, 1),
         ("ours, FringeDepthDataset.batches", through_ours, 255, EPOCHS),
         ("the copies alone", copies_only, 1, EPOCHS),
@@ -123,8 +142,13 @@ def compare(scratch: Path, args: argparse.Namespace) -> None:
     expected = list(read_png_mat(samples, files, args.batch, stored.size))
     milliseconds = []
     for name, batches, scale, epochs in readers:
-        for (fringe, depth), (expected_fringe, expected_depth) in zip(batches(), expected, strict=False):
-            if not (np.allclose(fringe * scale, expected_fringe, rtol=1e-6) and np.array_equal(depth, expected_depth)):
+        for (fringe, depth), (expected_fringe, expected_depth) in zip(
+            batches(), expected, strict=False
+        ):
+            if not (
+                np.allclose(fringe * scale, expected_fringe, rtol=1e-6)
+                and np.array_equal(depth, expected_depth)
+            ):
                 raise SystemExit(f"{name} reads different numbers than {readers[0][0]}")
         seconds = []
         for _ in range(args.repeats):

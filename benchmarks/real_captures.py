@@ -1,10 +1,12 @@
-"""The package on real light: calibration, decoding and one frame of public captures (not part of it).
+"""The package on real light: calibration, decoding and one frame of public captures (not part of
+it).
 
     python benchmarks/real_captures.py CAPTURES [--out PICTURES]
 
-CAPTURES is a folder with the captures of the public repository jakobwilm/slstudio: ``calibration/calseq1`` to
-``calseq6`` (six poses of a checkerboard of 9 x 13 inner corners) with ``calibration/calibration.xml``, ``skull_2x3``
-(three steps of 16 periods, three of one) and ``skull_gray`` (white, black, ten Gray bits) with ``pointCloud.mat``.
+CAPTURES is a folder with the captures of the public repository jakobwilm/slstudio:
+``calibration/calseq1`` to ``calseq6`` (six poses of a checkerboard of 9 x 13 inner corners) with
+``calibration/calibration.xml``, ``skull_2x3`` (three steps of 16 periods, three of one) and
+``skull_gray`` (white, black, ten Gray bits) with ``pointCloud.mat``.
 """
 
 import argparse
@@ -21,7 +23,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod, FringeNetMethod
+from fpp_ml_bench.baselines.learned.method import (
+    ClassicalNetMethod,
+    CrossedNetMethod,
+    FringeNetMethod,
+)
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.phase.geometry import wrapped
 from fpp_ml_bench.baselines.phase.method import CrossedMethod, PhaseMethod
@@ -39,16 +45,24 @@ from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.loaders.render.meshes import load_user_mesh, single_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
-from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, read_opencv_calibration, write_opencv_calibration
+from fpp_ml_bench.optics.opencv_files import (
+    OpenCvCalibration,
+    read_opencv_calibration,
+    write_opencv_calibration,
+)
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import load_rig
 
 SPACING_MM = 10.0
-"""Not recorded with the captures; with it our point clouds have the size of the authors' to 0.06%."""
+"""Not recorded with the captures; with it our point clouds have the size of the authors' to
+0.06%."""
 VERTICAL = "{scheme: phase-shift, pitches_px: [114, 1824], steps: 3, sign: -1}"
 HORIZONTAL = "{scheme: phase-shift, pitches_px: [71.25, 1140], steps: 3, sign: -1}"
-BOARD = f"projector: {{width: 1824, height: 1140}}\nsequence: {{vertical: {VERTICAL}, horizontal: {HORIZONTAL}, "
+BOARD = (
+    f"projector: {{width: 1824, height: 1140}}\nsequence: "
+    f"{{vertical: {VERTICAL}, horizontal: {HORIZONTAL}, "
+)
 SEQUENCES = {
     "skull_2x3": f"{{vertical: {VERTICAL}}}",
     "skull_gray": "{order: [white, black, vertical], vertical: {scheme: gray, cell_px: 2, bits: 10}}",
@@ -56,18 +70,26 @@ SEQUENCES = {
 }
 RANGE_MM = (300.0, 500.0)
 WORKING_RANGE_MM = (250.0, 700.0)
-"""What a user would give who does not know where the object stands; boards and desk are 300 to 600 mm away."""
+"""What a user would give who does not know where the object stands; boards and desk are 300 to 600
+mm away."""
 SKULL_RANGE_MM = (360.0, 430.0)  # the object's own
 FAR_MM = 20.0  # an error beyond it is of no use, whatever its cause
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("captures", type=Path, metavar="CAPTURES")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures")
     args = parser.parse_args()
     needed = [f"calibration/calseq{n}" for n in range(1, 7)]
-    needed += ["calibration/calibration.xml", "skull_2x3", "skull_gray", "skull_gray/pointCloud.mat"]
+    needed += [
+        "calibration/calibration.xml",
+        "skull_2x3",
+        "skull_gray",
+        "skull_gray/pointCloud.mat",
+    ]
     missing = [name for name in needed if not (args.captures / name).exists()]
     if missing:
         print(f"{args.captures}: missing {', '.join(missing)}", file=sys.stderr)
@@ -75,11 +97,15 @@ def main() -> int:
     theirs = read_opencv_calibration(args.captures / "calibration" / "calibration.xml")
     with tempfile.TemporaryDirectory() as scratch:
         ours, boards = calibrate(args.captures / "calibration", theirs, Path(scratch), args.out)
-        cloud = scipy.io.loadmat(args.captures / "skull_gray" / "pointCloud.mat")["xyz"].astype(np.float64)
+        cloud = scipy.io.loadmat(args.captures / "skull_gray" / "pointCloud.mat")["xyz"].astype(
+            np.float64
+        )
         for name in ("skull_2x3", "skull_gray"):
             for who, found in (("authors", theirs), ("ours", ours)):
                 rig = rig_of(found, name, Path(scratch))
-                decode(args.captures / name, rig, theirs.camera, cloud, f"{name}, calibration: {who}")
+                decode(
+                    args.captures / name, rig, theirs.camera, cloud, f"{name}, calibration: {who}"
+                )
         skull = rig_of(theirs, "skull_2x3", Path(scratch))
         decode(
             args.captures / "skull_2x3",
@@ -96,7 +122,11 @@ def main() -> int:
             one_frame(args.captures / "skull_2x3", skull.with_range(range_mm), Path(scratch))
         for number, (board, corners_px) in enumerate(boards, 1):
             capture = args.captures / "calibration" / f"calseq{number}"
-            reference(capture, rig_of(theirs, "board", Path(scratch)).with_range(WORKING_RANGE_MM), "authors")
+            reference(
+                capture,
+                rig_of(theirs, "board", Path(scratch)).with_range(WORKING_RANGE_MM),
+                "authors",
+            )
             phase_of_one_sinusoid(capture, board)
             one_frame(capture, board, Path(scratch), corners_px)
     return 0
@@ -105,8 +135,9 @@ def main() -> int:
 def calibrate(
     folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Path | None
 ) -> tuple["OpenCvCalibration", list[tuple["Rig", NDArray]]]:
-    """Print errors and rigs of several models, and return the one whose held-out error is the least, and for each pose
-    the rig that this model finds from the other five, with the pose's corners in camera px (n, 2)."""
+    """Print errors and rigs of several models, and return the one whose held-out error is the
+    least, and for each pose the rig that this model finds from the other five, with the pose's
+    corners in camera px (n, 2)."""
     poses_folder, sequence = scratch / "poses", scratch / "board.yaml"
     poses_folder.mkdir()
     for number in range(1, 7):
@@ -116,14 +147,24 @@ def calibrate(
     started = perf_counter()
     poses, stand_in, response = board_poses(poses_folder, board, sequence)
     found_in = perf_counter() - started
-    sizes = (theirs.camera.width, theirs.camera.height), (theirs.projector.width, theirs.projector.height)
-    print(f"six poses, {sum(len(pose.corners_px) for pose in poses)} corners, found in {found_in:.0f} s")
+    sizes = (
+        (theirs.camera.width, theirs.camera.height),
+        (theirs.projector.width, theirs.projector.height),
+    )
+    print(
+        f"six poses, {sum(len(pose.corners_px) for pose in poses)} corners, found in "
+        f"{found_in:.0f} s"
+    )
     if response is not None:
         print(
-            f"response: gamma {response.gamma:.3f} +- {response.sigma:.3f}, misfit {response.misfit_grey:.2f} grey "
+            f"response: gamma {response.gamma:.3f} +- {response.sigma:.3f}, misfit "
+            f"{response.misfit_grey:.2f} grey "
             f"levels, white on the board {response.white_grey:.0f} of 255"
         )
-    print("calibration, RMS in px                            camera  alone  projector  alone  stereo  left out")
+    print(
+        "calibration, RMS in px                            camera  alone  projector  alone  stereo "
+        " left out"
+    )
     errors = theirs.errors_px
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")
     own = (Lens("radial-1", True, True), Lens("radial-1", True))
@@ -138,7 +179,8 @@ def calibrate(
         found = calibrate_rig(poses, board, *sizes, lens, estimate_board=free)
         alone = found.alone_rms_px
         print(
-            f"{title:<50}{found.rms_px.camera:6.3f} {alone[0]:6.3f}  {found.rms_px.projector:8.3f} {alone[1]:6.3f}"
+            f"{title:<50}{found.rms_px.camera:6.3f} {alone[0]:6.3f}  {found.rms_px.projector:8.3f} "
+            f"{alone[1]:6.3f}"
             f"{found.rms_px.both:8.3f}{found.held_out_rms_px:10.3f}"
         )
         results.append((found, lens, free))
@@ -147,12 +189,16 @@ def calibrate(
     for name in ("camera", "projector"):
         for who, device in (("authors", getattr(theirs, name)), ("ours", getattr(rig, name))):
             print(
-                f"{name:<10} {who:<8} f {device.fx:8.1f} {device.fy:8.1f}  c {device.cx:7.1f} {device.cy:7.1f}  "
+                f"{name:<10} {who:<8} f {device.fx:8.1f} {device.fy:8.1f}  c {device.cx:7.1f} "
+                f"{device.cy:7.1f}  "
                 f"k1 {device.distortion[0]:+.4f}"
             )
     for who, shift in (("authors", theirs.translation_m), ("ours", best.translation_m)):
         x, y, z = (1000 * length for length in shift)
-        print(f"translation {who:<8} {x:8.2f} {y:8.2f} {z:8.2f} mm, baseline {np.linalg.norm([x, y, z]):.2f} mm")
+        print(
+            f"translation {who:<8} {x:8.2f} {y:8.2f} {z:8.2f} mm, baseline "
+            f"{np.linalg.norm([x, y, z]):.2f} mm"
+        )
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "calibration.png").write_bytes(draw_residuals(best))
@@ -168,17 +214,24 @@ def rig_of(found: "OpenCvCalibration", name: str, scratch: Path) -> "Rig":
     """A rig with a calibration and the sequence of a capture."""
     write_opencv_calibration(found, scratch / "found.yml", unit="m")
     text = (
-        f"calibration: {{file: found.yml, unit: m}}\nworking_range_mm: {list(RANGE_MM)}\nsequence: {SEQUENCES[name]}\n"
+        f"calibration: {{file: found.yml, unit: m}}\nworking_range_mm: {list(RANGE_MM)}\nsequence: "
+        f"{SEQUENCES[name]}\n"
     )
     (scratch / "rig.yaml").write_text(text, encoding="utf-8")
     return load_rig(scratch / "rig.yaml")
 
 
 def decode(
-    folder: Path, rig: "Rig", camera: "Pinhole", cloud: NDArray, title: str, method: Method | None = None
+    folder: Path,
+    rig: "Rig",
+    camera: "Pinhole",
+    cloud: NDArray,
+    title: str,
+    method: Method | None = None,
 ) -> None:
-    """Decode a capture (by ``method``) and compare with the authors' cloud, which lies on the undistorted grid of their
-    ``camera``: in depth, and as points after a rigid motion, since another principal point turns the camera's frame."""
+    """Decode a capture (by ``method``) and compare with the authors' cloud, which lies on the
+    undistorted grid of their ``camera``: in depth, and as points after a rigid motion, since
+    another principal point turns the camera's frame."""
     frames = read_frames(folder, count=len(rig.sequence)).frames
     method = method or ClassicalMethod(rig, threads=2)
     started = perf_counter()
@@ -193,17 +246,21 @@ def decode(
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(difference - median)))
     within = float((np.abs(difference) < 2).mean())
     x, y = (axis[rows, columns][both] for axis in rig.camera.rays())
-    apart, scale = after_motion(np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[both, None], theirs[both])
+    apart, scale = after_motion(
+        np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[both, None], theirs[both]
+    )
     print(
-        f"{title:<34} {both.sum():,} of {len(theirs):,} px: median {median:+.3f} mm, robust sigma {sigma:.3f} mm, "
-        f"{100 * within:.2f}% within 2 mm; noise {bend_noise_mm(answer.depth):.3f} mm; {seconds:.1f} s; after a "
+        f"{title:<34} {both.sum():,} of {len(theirs):,} px: median {median:+.3f} mm, robust sigma "
+        f"{sigma:.3f} mm, "
+        f"{100 * within:.2f}% within 2 mm; noise {bend_noise_mm(answer.depth):.3f} mm; "
+        f"{seconds:.1f} s; after a "
         f"rigid motion: median distance {apart:.3f} mm, their size / ours {scale:.5f}"
     )
 
 
 def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[float, float]:
-    """Median distance of points (n, 3) from ``target`` after the best rigid motion, without outliers, and the ratio of
-    their sizes."""
+    """Median distance of points (n, 3) from ``target`` after the best rigid motion, without
+    outliers, and the ratio of their sizes."""
     kept = np.ones(len(points), dtype=bool)
     for _ in range(8):
         a, b = points[kept].mean(axis=0), target[kept].mean(axis=0)
@@ -216,7 +273,8 @@ def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tu
 
 
 def twin(folder: Path, rig: "Rig", scratch: Path) -> None:
-    """Render a ball before the same rig by the light `paper`, and compare modulation and noise with the real frames."""
+    """Render a ball before the same rig by the light `paper`, and compare modulation and noise with
+    the real frames."""
     import trimesh
 
     trimesh.creation.icosphere(subdivisions=5, radius=0.04).export(scratch / "ball.stl")
@@ -227,17 +285,21 @@ def twin(folder: Path, rig: "Rig", scratch: Path) -> None:
     rendered = [row.frames[index] for index in range(len(rig.sequence))]
     real = list(read_frames(folder, count=len(rig.sequence)).frames)
     for title, frames in (("twin, light paper", rendered), ("real frames", real)):
-        decoded = decode_stack(frames, virtual if title != "real frames" else rig, details=True, threads=2)
+        decoded = decode_stack(
+            frames, virtual if title != "real frames" else rig, details=True, threads=2
+        )
         found, noise_mm = decoded.depth_mm > 0, bend_noise_mm(decoded.depth_mm)
         modulation = float(np.median(decoded.details["vertical"].modulation[found]))
         print(
-            f"{title:<20} {found.sum():,} px: modulation {modulation:.1f} grey levels, noise of depth {noise_mm:.3f} mm"
+            f"{title:<20} {found.sum():,} px: modulation {modulation:.1f} grey levels, noise of "
+            f"depth {noise_mm:.3f} mm"
         )
 
 
 def bend_noise_mm(depth_mm: NDArray[np.float32]) -> float:
-    """Noise of a depth map, of which 0 is none: from second differences along the rows, which a smooth surface has not.
-    Neighbours are taken for independent: an average over neighbours reads lower than its error is."""
+    """Noise of a depth map, of which 0 is none: from second differences along the rows, which a
+    smooth surface has not. Neighbours are taken for independent: an average over neighbours reads
+    lower than its error is."""
     depth = np.where(depth_mm > 0, depth_mm.astype(np.float64), np.nan)
     bends = depth[:, 2:] - 2 * depth[:, 1:-1] + depth[:, :-2]
     bends = bends[np.isfinite(bends) & (np.abs(bends) < 3)]
@@ -245,7 +307,8 @@ def bend_noise_mm(depth_mm: NDArray[np.float32]) -> float:
 
 
 def reference(folder: Path, rig: "Rig", who: str) -> tuple[NDArray, Decoded]:
-    """The frames of a capture and what all of them give; prints how much of the lit pixels that is."""
+    """The frames of a capture and what all of them give; prints how much of the lit pixels that
+    is."""
     frames = read_frames(folder, count=len(rig.sequence)).frames
     decoded = decode_stack(frames, rig, threads=2)
     lit = decoded.depth_mm.size - decoded.counts["low_modulation"]
@@ -258,32 +321,46 @@ def reference(folder: Path, rig: "Rig", who: str) -> tuple[NDArray, Decoded]:
 
 
 def one_frame(folder: Path, rig: "Rig", scratch: Path, corners_px: NDArray | None = None) -> None:
-    """One frame in the rig's range against the depth that all of them give there: `phase` on the first fringe of each
-    direction; where there are both, `crossed` and `crossed-net` on the mean of the two, which is a crossed frame; where
-    there is one, also with the mask given. Of all pixels, and of those between ``corners_px`` (n, 2) of a board."""
+    """One frame in the rig's range against the depth that all of them give there: `phase` on the
+    first fringe of each direction; where there are both, `crossed` and `crossed-net` on the mean of
+    the two, which is a crossed frame; where there is one, also with the mask given. Of all pixels,
+    and of those between ``corners_px`` (n, 2) of a board."""
     frames, decoded = reference(folder, rig, "ours")
     known = decoded.depth_mm > 0
     parts = {"all": known}
     if corners_px is not None:
         hull = cv2.convexHull(np.rint(corners_px).astype(np.int32))
-        parts["between the corners"] = known & (cv2.fillConvexPoly(np.zeros(known.shape, np.uint8), hull, 1) > 0)
+        parts["between the corners"] = known & (
+            cv2.fillConvexPoly(np.zeros(known.shape, np.uint8), hull, 1) > 0
+        )
     methods = [(f"phase, {way}", PhaseMethod(rig, direction=way), way) for way in rig.directions]
     if len(rig.directions) == 2:
         # An order of the vertical fringes is the smaller step in depth.
-        methods += [("crossed", CrossedMethod(rig), "vertical"), ("crossed-net", CrossedNetMethod(rig), "vertical")]
+        methods += [
+            ("crossed", CrossedMethod(rig), "vertical"),
+            ("crossed-net", CrossedNetMethod(rig), "vertical"),
+        ]
     else:
         Image.fromarray(known.astype(np.uint8) * 255).save(scratch / "mask.png")
         given = PhaseMethod(rig, mask=scratch / "mask.png", direction=rig.directions[0])
         methods.append((f"phase, {rig.directions[0]}, mask given", given, rig.directions[0]))
     for title, method, way in methods:
-        needed = [frame if index in method.frames_used else None for index, frame in enumerate(frames)]
+        needed = [
+            frame if index in method.frames_used else None for index, frame in enumerate(frames)
+        ]
         started = perf_counter()
         answer = method.answer(needed)
         seconds = perf_counter() - started
-        print(f"  {title}: {seconds:.1f} s; without a reference {((answer.depth > 0) & ~known).sum():,} px")
+        print(
+            f"  {title}: {seconds:.1f} s; without a reference "
+            f"{((answer.depth > 0) & ~known).sum():,} px"
+        )
         for part, asked in parts.items():
             both = asked & (answer.depth > 0)
-            print(f"    {part}: answered {100 * both.sum() / asked.sum():.1f}% of {asked.sum():,} px", end="")
+            print(
+                f"    {part}: answered {100 * both.sum() / asked.sum():.1f}% of {asked.sum():,} px",
+                end="",
+            )
             if both.any():
                 rays = tuple(axis[both] for axis in rig.camera.rays())
                 slope = np.abs(coordinate_slope_px_per_mm(rig, decoded.depth_mm[both], way, rays))
@@ -291,16 +368,19 @@ def one_frame(folder: Path, rig: "Rig", scratch: Path, corners_px: NDArray | Non
                 wrong, beyond = error * slope > rig.pitch(way) / 2, error > FAR_MM
                 confident = beyond & (answer.sigma_mm[both] < corruptions().confident_below * error)
                 print(
-                    f", median error {np.median(error):.2f} mm, beyond {FAR_MM:g} mm {100 * beyond.mean():.2f}%, wrong "
-                    f"orders {100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%",
+                    f", median error {np.median(error):.2f} mm, beyond {FAR_MM:g} mm "
+                    f"{100 * beyond.mean():.2f}%, wrong "
+                    f"orders {100 * wrong.mean():.2f}%, confident errors "
+                    f"{100 * confident.mean():.3f}%",
                     end="",
                 )
             print(flush=True)
 
 
 def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
-    """The wrapped phase of the first sinusoid of each direction, by the local fit of the phase route and by
-    fringe-net, against that of all three steps. The mask is given: where all frames have a depth."""
+    """The wrapped phase of the first sinusoid of each direction, by the local fit of the phase
+    route and by fringe-net, against that of all three steps. The mask is given: where all frames
+    have a depth."""
     frames = read_frames(folder, count=len(rig.sequence)).frames
     decoded = decode_stack(frames, rig, details=True, threads=2)
     on_object = decoded.depth_mm > 0
@@ -317,9 +397,12 @@ def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
             error = np.abs(wrapped(phase - details.phase))
             kept, inner = on_object & np.isfinite(error), on_object & np.isfinite(error) & ~near
             print(
-                f"phase of one {way} sinusoid, {folder.name}, {title}: interior {error[inner].mean():.3f} rad, "
-                f"within {EDGE_BAND_PX} px of depth edges {error[kept & ~inner].mean():.3f}, median "
-                f"{np.median(error[kept]):.3f}, beyond 0.3 rad {100 * (error[kept] > 0.3).mean():.1f}% "
+                f"phase of one {way} sinusoid, {folder.name}, {title}: interior "
+                f"{error[inner].mean():.3f} rad, "
+                f"within {EDGE_BAND_PX} px of depth edges {error[kept & ~inner].mean():.3f}, "
+                f"median "
+                f"{np.median(error[kept]):.3f}, beyond 0.3 rad "
+                f"{100 * (error[kept] > 0.3).mean():.1f}% "
                 f"of {kept.sum():,} px"
             )
 

@@ -1,12 +1,14 @@
-"""Does a build give the same bytes on other processors? Builds a small set as if this were one, and compares.
+"""Does a build give the same bytes on other processors? Builds a small set as if this were one, and
+compares.
 
     python benchmarks/same_bytes.py [--preset mini] [--size 176] [--objects mug,mustard_bottle] [--work DIR]
 
-Each build is a process of its own that is denied some of this processor's instruction sets: numba compiles for a
-generic x86-64, NumPy and the C library leave out AVX2, AVX-512 and fused multiply-adds, OpenBLAS takes its oldest
-kernels. Prints a fingerprint for each, a hash of all 70 meshes in float64, and one of two frames of every robustness
-axis at its last severity; exit status 1 if two differ. With no options a minute or two; ``--preset full --size 960`` is
-the whole benchmark.
+Each build is a process of its own that is denied some of this processor's instruction sets: numba
+compiles for a generic x86-64, NumPy and the C library leave out AVX2, AVX-512 and fused
+multiply-adds, OpenBLAS takes its oldest kernels. Prints a fingerprint for each, a hash of all 70
+meshes in float64, and one of two frames of every robustness axis at its last severity; exit status
+1 if two differ. With no options a minute or two; ``--preset full --size 960`` is the whole
+benchmark.
 """
 
 import argparse
@@ -58,19 +60,29 @@ for axis in corruptions().axes:
 print(digest.hexdigest(), frames.hexdigest())
 sys.exit(main(sys.argv[1:]))
 """
-"""Prints a hash of all 70 meshes in float64, whose last bits float32 depths would hide, and one of disturbed frames,
-and runs `fpp-bench`."""
+"""Prints a hash of all 70 meshes in float64, whose last bits float32 depths would hide, and one of
+disturbed frames, and runs `fpp-bench`."""
 
 
 def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str, str]:
-    """Fingerprint of a build by `fpp-bench build` with the environment of ``way``, and the hashes of the meshes and of
-    disturbed frames."""
+    """Fingerprint of a build by `fpp-bench build` with the environment of ``way``, and the hashes
+    of the meshes and of disturbed frames."""
     environment = {**os.environ, **WAYS[way]}
     workers = environment.pop("WORKERS", "2")
     if "NUMBA_CPU_NAME" in WAYS[way]:
         environment["NUMBA_CACHE_DIR"] = str(work / "compiled")
     folder = work / way.replace(" ", "-")
-    command = [sys.executable, "-c", MESHES, "build", "--out", str(folder), *settings, "--workers", workers]
+    command = [
+        sys.executable,
+        "-c",
+        MESHES,
+        "build",
+        "--out",
+        str(folder),
+        *settings,
+        "--workers",
+        workers,
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"{way}: the build failed:\n{done.stderr}")
@@ -81,12 +93,25 @@ def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str, s
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", choices=("mini", "full", "unseen"), default="mini", help="preset (default: mini)")
-    parser.add_argument("--size", type=int, default=176, metavar="PX", help="image size (default: 176)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--preset",
+        choices=("mini", "full", "unseen"),
+        default="mini",
+        help="preset (default: mini)",
+    )
+    parser.add_argument(
+        "--size", type=int, default=176, metavar="PX", help="image size (default: 176)"
+    )
     parser.add_argument("--objects", metavar="A,B", help="objects (default: the preset's)")
-    parser.add_argument("--light", default="paper", metavar="NAME|FILE", help="light (default: paper)")
-    parser.add_argument("--work", type=Path, help="folder to work in (default: a temporary one, removed afterwards)")
+    parser.add_argument(
+        "--light", default="paper", metavar="NAME|FILE", help="light (default: paper)"
+    )
+    parser.add_argument(
+        "--work", type=Path, help="folder to work in (default: a temporary one, removed afterwards)"
+    )
     parser.add_argument("--only", nargs="+", choices=WAYS, metavar="WAY", help="some of the ways")
     args = parser.parse_args()
     settings = ["--preset", args.preset, "--size", str(args.size), "--light", args.light]
@@ -96,7 +121,10 @@ def main() -> int:
         for way in args.only or WAYS:
             prints[way] = fingerprints(way, settings, Path(folder))
             fingerprint, meshes, frames = prints[way]
-            print(f"{fingerprint[:16]}  meshes {meshes[:8]}  disturbed {frames[:8]}  {way}", flush=True)
+            print(
+                f"{fingerprint[:16]}  meshes {meshes[:8]}  disturbed {frames[:8]}  {way}",
+                flush=True,
+            )
     same = len(set(prints.values())) == 1
     print(f"{len(prints)} builds, {'one fingerprint' if same else 'DIFFERENT fingerprints'}")
     return 0 if same else 1

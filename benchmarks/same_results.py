@@ -1,13 +1,14 @@
-"""Does the program still compute the same? Records what every command computes, and compares it bit for bit.
+"""Does the program still compute the same? Records what every command computes, and compares it bit
+for bit.
 
     python benchmarks/same_results.py record FILE.json [--only SECTION] [--skip SECTION] [--keep DIR]
     python benchmarks/same_results.py compare FILE.json [--only SECTION] [--skip SECTION] [--keep DIR]
 
-Knows only the installed commands and plain file formats, and nothing of the package: modules can move between the two.
-Every item is a hash, with the numbers beside it where they are small. Left out are times, dates, machine and versions.
-Items are named after the spelling that commands had at first, so that an old record can be compared: `spelled` has that
-of today.
-``compare`` prints one line for each item that differs; exit status 1 if there is one. Sections: build, train, predict,
+Knows only the installed commands and plain file formats, and nothing of the package: modules can
+move between the two. Every item is a hash, with the numbers beside it where they are small. Left
+out are times, dates, machine and versions. Items are named after the spelling that commands had at
+first, so that an old record can be compared: `spelled` has that of today. ``compare`` prints one
+line for each item that differs; exit status 1 if there is one. Sections: build, train, predict,
 leaderboard, reports. About eight minutes on one core.
 """
 
@@ -144,7 +145,8 @@ def digest(value: bytes) -> dict[str, Any]:
 
 
 def numbers(value: Any) -> dict[str, Any]:
-    """Hash of plain values and the values themselves; NaN, -0.0 and every bit of a float have their own text."""
+    """Hash of plain values and the values themselves; NaN, -0.0 and every bit of a float have their
+    own text."""
     return {**digest(json.dumps(value, sort_keys=True).encode()), "value": value}
 
 
@@ -154,14 +156,18 @@ def array(value: np.ndarray[Any, Any]) -> dict[str, Any]:
 
 def text(words: str) -> list[str]:
     """Lines without the package's version and the folders of absolute paths."""
-    words = re.sub(r"(?<!\S)/(?:[^\s/:]+/)+", "", re.sub(r"fpp-ml-bench \d+\.\d+\.\d+", "fpp-ml-bench", words))
+    words = re.sub(
+        r"(?<!\S)/(?:[^\s/:]+/)+", "", re.sub(r"fpp-ml-bench \d+\.\d+\.\d+", "fpp-ml-bench", words)
+    )
     return [line.rstrip() for line in words.splitlines()]
 
 
 def steady(value: Any) -> Any:
     """``value`` without what differs between two runs; text that is itself JSON is read."""
     if isinstance(value, dict):
-        return {key: steady(inner) for key, inner in value.items() if not LEFT_OUT.fullmatch(str(key))}
+        return {
+            key: steady(inner) for key, inner in value.items() if not LEFT_OUT.fullmatch(str(key))
+        }
     if isinstance(value, list):
         return [steady(inner) for inner in value]
     if isinstance(value, str) and value.startswith("{"):
@@ -170,7 +176,8 @@ def steady(value: Any) -> Any:
 
 
 def contents(path: Path, name: str, is_data: bool) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Items of one file, read as its suffix says; any other file by its bytes. ``is_data``: its times and dates too."""
+    """Items of one file, read as its suffix says; any other file by its bytes. ``is_data``: its
+    times and dates too."""
     clean = (lambda value: value) if is_data else steady
     if path.suffix == ".json":
         value = clean(json.loads(path.read_text()))
@@ -190,7 +197,12 @@ def contents(path: Path, name: str, is_data: bool) -> Iterator[tuple[str, dict[s
     elif path.suffix == ".safetensors":
         with safe_open(path, "np") as file:
             # A checkpoint's own hash covers its times.
-            yield name, numbers({key: v for key, v in steady(file.metadata() or {}).items() if key != "sha256"})
+            yield (
+                name,
+                numbers(
+                    {key: v for key, v in steady(file.metadata() or {}).items() if key != "sha256"}
+                ),
+            )
             for key in sorted(file.keys()):
                 yield f"{name} {key}", array(file.get_tensor(key))
     elif path.suffix == ".parquet":
@@ -211,36 +223,51 @@ def contents(path: Path, name: str, is_data: bool) -> Iterator[tuple[str, dict[s
 
 @dataclass
 class Recorder:
-    """Runs commands in ``work``, where all paths are relative, and keeps what they compute, by section and item."""
+    """Runs commands in ``work``, where all paths are relative, and keeps what they compute, by
+    section and item."""
 
     work: Path
     wanted: tuple[str, ...]
     items: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
 
     def run(self, section: str, command: str, *written: str, output: bool = False) -> bool:
-        """One command, and items of the files or folders that it wrote, and of its standard output if asked."""
+        """One command, and items of the files or folders that it wrote, and of its standard output
+        if asked."""
         start = perf_counter()
         now, needed = spelled(command)
         arguments = now.split()
         program = Path(sys.executable).parent / arguments[0]
         variables = {"OMP_NUM_THREADS": "1", "COLUMNS": "160", "NO_COLOR": "1", **needed}
         done = subprocess.run(
-            [program, *arguments[1:]], cwd=self.work, env={**os.environ, **variables}, capture_output=True, text=True
+            [program, *arguments[1:]],
+            cwd=self.work,
+            env={**os.environ, **variables},
+            capture_output=True,
+            text=True,
         )
         if done.returncode:
-            message = done.stderr[max(done.stderr.find("error:"), 0) :]  # a progress bar can stand before it
-            self.add(section, command, numbers([done.returncode, *text(message), *text(done.stdout)]))
+            message = done.stderr[
+                max(done.stderr.find("error:"), 0) :
+            ]  # a progress bar can stand before it
+            self.add(
+                section, command, numbers([done.returncode, *text(message), *text(done.stdout)])
+            )
         elif output:
             self.add(section, f"{command}: output", numbers(text(done.stdout)))
         for name in written:
             root = self.work / name
             for path in sorted(root.rglob("*")) if root.is_dir() else [root] * root.exists():
                 if path.is_file():
-                    for item, value in contents(path, path.relative_to(self.work).as_posix(), section == "leaderboard"):
+                    for item, value in contents(
+                        path, path.relative_to(self.work).as_posix(), section == "leaderboard"
+                    ):
                         self.add(section, f"{command}: {item}", value)
         print(f"{section:12} {perf_counter() - start:5.1f} s  {command}", flush=True)
         if done.returncode:
-            print(f"{'':12} exit status {done.returncode}: {' '.join(done.stderr.split())[-300:]}", flush=True)
+            print(
+                f"{'':12} exit status {done.returncode}: {' '.join(done.stderr.split())[-300:]}",
+                flush=True,
+            )
         return done.returncode == 0
 
     def add(self, section: str, item: str, value: dict[str, Any]) -> None:
@@ -265,25 +292,41 @@ def build(recorder: Recorder) -> None:
         if "build" in recorder.wanted:
             recorder.run("build", f"fpp-bench info {name} --json", output=True)
     if "build" in recorder.wanted:
-        for command in ("info three", "info mini", "verify three", "verify mini", "verify every-object", "info none"):
+        for command in (
+            "info three",
+            "info mini",
+            "verify three",
+            "verify mini",
+            "verify every-object",
+            "info none",
+        ):
             recorder.run("build", f"fpp-bench {command}", output=True)
         recorder.run("build", "fpp-bench build bad --objects no_such_object")
 
 
 def train(recorder: Recorder) -> None:
-    """Two short epochs of every shipped recipe; the weights of a part of them predict and are scored."""
-    for number, (table, row) in enumerate((table, row) for table, rows in RECIPES.items() for row in rows.split()):
+    """Two short epochs of every shipped recipe; the weights of a part of them predict and are
+    scored."""
+    for number, (table, row) in enumerate(
+        (table, row) for table, rows in RECIPES.items() for row in rows.split()
+    ):
         content: dict[str, Any] = {"extends": f"{table}/{row}", **SHORT}
         if row == "transunet":
             content["options"] = {"map_size": 14, "patch": 2}
         recorder.work.joinpath(f"{table}-{row}.yaml").write_text(yaml.safe_dump(content))
         out = f"runs/{table}-{row}"
-        trained = recorder.run("train", f"fpp-bench train {table}-{row}.yaml small --out {out}", out)
+        trained = recorder.run(
+            "train", f"fpp-bench train {table}-{row}.yaml small --out {out}", out
+        )
         if trained and table in SCORED:
             recorder.predict("train", f"{out}/weights.safetensors small", number)
     out = "runs/phase-net"
-    recorder.run("train", f"fpp-bench train phase-net --steps 2 --lights 0 --unions 0 --out {out}", out)
-    recorder.predict("train", f"phase-net small --weights {out}/phase-net-one-albedo.safetensors", 99)
+    recorder.run(
+        "train", f"fpp-bench train phase-net --steps 2 --lights 0 --unions 0 --out {out}", out
+    )
+    recorder.predict(
+        "train", f"phase-net small --weights {out}/phase-net-one-albedo.safetensors", 99
+    )
     recorder.run("train", "fpp-bench train loss/l1 mini --out runs/refused")
     recorder.run("train", "fpp-bench train loss/none small --out runs/refused")
     recorder.run("train", "fpp-bench reproduce --list", output=True)
@@ -297,7 +340,12 @@ def predict(recorder: Recorder) -> None:
     scored = f"fpp-eval {second} --dataset mini"
     recorder.run("predict", f"{scored} --json plain.json --edge-band 5", "plain.json")
     recorder.run("predict", f"{scored} --split validation --json none.json")
-    recorder.run("predict", f"fpp-eval compare {first}.json {second}.json --json pair.json", "pair.json", output=True)
+    recorder.run(
+        "predict",
+        f"fpp-eval compare {first}.json {second}.json --json pair.json",
+        "pair.json",
+        output=True,
+    )
     recorder.run("predict", f"fpp-eval verify {second}.json {second} --dataset mini", output=True)
     recorder.run("predict", "fpp-eval schema", output=True)
     shutil.copytree(recorder.work / second, recorder.work / "npz")
@@ -310,12 +358,15 @@ def predict(recorder: Recorder) -> None:
 
 
 def leaderboard(recorder: Recorder) -> None:
-    """Tables and page of the shipped rows. Their times are data here, and text of the page, so they stay."""
+    """Tables and page of the shipped rows. Their times are data here, and text of the page, so they
+    stay."""
     recorder.run("leaderboard", "fpp-bench leaderboard --page page", "page")
     files = ("ranking.md", "ranking.json")
     options = "--paper all --markdown ranking.md --json ranking.json"
     recorder.run("leaderboard", f"fpp-bench leaderboard {options}", *files, output=True)
-    recorder.run("leaderboard", "fpp-bench leaderboard --sort overall_rmse_mm --paper none", output=True)
+    recorder.run(
+        "leaderboard", "fpp-bench leaderboard --sort overall_rmse_mm --paper none", output=True
+    )
 
 
 def reports(recorder: Recorder) -> None:
@@ -335,7 +386,9 @@ def reports(recorder: Recorder) -> None:
     for number, method in enumerate(methods):
         command = f"fpp-bench reliance {method} --views 1 --threads 1 --json reliance-{number}.json"
         recorder.run("reports", command, f"reliance-{number}.json")
-    recorder.run("reports", "fpp-bench stability --quick --out stability", "stability/stability.json")
+    recorder.run(
+        "reports", "fpp-bench stability --quick --out stability", "stability/stability.json"
+    )
     for number, method in enumerate(("unet-individual-rmse small", "phase small")):
         command = f"fpp-bench diagnose {method} --quick --threads 1 --out diagnosis-{number}"
         recorder.run("reports", command, f"diagnosis-{number}/diagnose.json")
@@ -343,7 +396,8 @@ def reports(recorder: Recorder) -> None:
     command = "fpp-bench tradeoff small --quick --out tradeoff"
     recorder.run("reports", command, "tradeoff/tradeoff.json")
     commands = (
-        "build import info verify show export train predict time tradeoff reproduce reliance diagnose leaderboard"
+        "build import info verify show export train predict time tradeoff reproduce reliance "
+        "diagnose leaderboard"
     )
     for command in ("", *commands.split(), "stability", "publish"):
         recorder.run("reports", f"fpp-bench {command} --help", output=True)
@@ -367,7 +421,13 @@ def record(wanted: tuple[str, ...], keep: Path | None) -> dict[str, dict[str, di
 
 def leaves(value: Any, at: str = "") -> Iterator[tuple[str, str]]:
     """Path and text of every single value."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
+    pairs = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else None
+    )
     if not pairs:
         yield at, json.dumps(value)
     else:
@@ -388,12 +448,22 @@ def difference(old: dict[str, Any] | None, new: dict[str, Any] | None) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("action", choices=("record", "compare"), help="write FILE, or run again and compare with it")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "action", choices=("record", "compare"), help="write FILE, or run again and compare with it"
+    )
     parser.add_argument("file", type=Path, metavar="FILE.json", help="what was recorded")
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="only these sections")
-    parser.add_argument("--skip", nargs="+", choices=SECTIONS, default=(), help="not these sections")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="new folder to work in, which stays")
+    parser.add_argument(
+        "--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="only these sections"
+    )
+    parser.add_argument(
+        "--skip", nargs="+", choices=SECTIONS, default=(), help="not these sections"
+    )
+    parser.add_argument(
+        "--keep", type=Path, metavar="DIR", help="new folder to work in, which stays"
+    )
     args = parser.parse_args()
     before = json.loads(args.file.read_text()) if args.action == "compare" else {}
     after = record(tuple(name for name in args.only if name not in args.skip), args.keep)

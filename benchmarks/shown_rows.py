@@ -2,16 +2,16 @@
 
     python benchmarks/shown_rows.py [--check]
 
-- Pictures in ``docs/pictures``: ``leaderboard.png``, the first screen of the page by chromium, and ``charge.png``, the
-  two-sided MAE of the methods of one frame against what a missed or invented pixel costs. Each holds the hash of the
-  rows that it shows.
-- Tables between ``<!-- rows: NAME NAME; KEY KEY -->`` and ``<!-- end of rows -->``: a line for each row file, a column
-  for each score, with ``frames`` and ``time_ms`` among them.
-- Figures in sentences are links: ``[2.4](../../leaderboard/rows/crossed.json "object_mae_mm")``; several are separated
-  by a slash between blanks, in the text and in the title.
+- Pictures in ``docs/pictures``: ``leaderboard.png``, the first screen of the page by chromium, and
+  ``charge.png``, the two-sided MAE of the methods of one frame against what a missed or invented
+  pixel costs. Each holds the hash of the rows that it shows.
+- Tables between ``<!-- rows: NAME NAME; KEY KEY -->`` and ``<!-- end of rows -->``: a line for each
+  row file, a column for each score, with ``frames`` and ``time_ms`` among them.
+- Figures in sentences are links: ``[2.4](../../leaderboard/rows/crossed.json "object_mae_mm")``;
+  several are separated by a slash between blanks, in the text and in the title.
 
-With ``--check`` nothing is made: what is older than its row is listed, and the exit status is 1. Figures in sentences
-are listed in any case, since only their author can mend them.
+With ``--check`` nothing is made: what is older than its row is listed, and the exit status is 1.
+Figures in sentences are listed in any case, since only their author can mend them.
 """
 
 import argparse
@@ -50,7 +50,9 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"
 SCREEN, CHARGE = PICTURES / "leaderboard.png", PICTURES / "charge.png"
 ROWS_KEY = "rows"
-_TABLE = re.compile(r"(<!-- rows: ([\w .-]+); ([\w ]+) -->)\n(?:.*?)(<!-- end of rows -->)", re.DOTALL)
+_TABLE = re.compile(
+    r"(<!-- rows: ([\w .-]+); ([\w ]+) -->)\n(?:.*?)(<!-- end of rows -->)", re.DOTALL
+)
 _FIGURE = re.compile(r"\[([\d./ ]+)\]\([./]*leaderboard/rows/([\w.-]+)\.json \"([\w/ ]+)\"\)")
 CHARGES_MM = np.geomspace(3, 3000, 61)
 CURVES = 8
@@ -65,9 +67,12 @@ def rows_hash() -> str:
 
 
 def first_screen() -> bytes:
-    """The page's first screen, PNG. Raises CalledProcessError and FileNotFoundError where there is no chromium."""
+    """The page's first screen, PNG. Raises CalledProcessError and FileNotFoundError where there is
+    no chromium."""
     with tempfile.TemporaryDirectory() as folder:
-        index, *_ = write_page(rank(read_entries(shipped_rows())), chosen_tables(None), Path(folder, "page"))
+        index, *_ = write_page(
+            rank(read_entries(shipped_rows())), chosen_tables(None), Path(folder, "page")
+        )
         words = [
             "chromium",
             "--headless",
@@ -77,23 +82,39 @@ def first_screen() -> bytes:
             "--window-size=1440,900",
         ]
         shot = Path(folder, "shot.png")
-        subprocess.run([*words, f"--screenshot={shot}", index.resolve().as_uri()], check=True, capture_output=True)
+        subprocess.run(
+            [*words, f"--screenshot={shot}", index.resolve().as_uri()],
+            check=True,
+            capture_output=True,
+        )
         return shot.read_bytes()
 
 
 def of_one_frame(groups: Sequence[Group]) -> tuple[Group, list[Ranked]]:
-    """The first table of one frame on the metric track, and its rows without trivial ones, the least error first."""
-    groups = [group for group in groups if group.key.data_title == groups[0].key.data_title and group.vouched]
-    of_class = [group for group in groups if group.key.frames == FRAMES_CLASSES[0] and group.key.track == "metric"]
+    """The first table of one frame on the metric track, and its rows without trivial ones, the
+    least error first."""
+    groups = [
+        group
+        for group in groups
+        if group.key.data_title == groups[0].key.data_title and group.vouched
+    ]
+    of_class = [
+        group
+        for group in groups
+        if group.key.frames == FRAMES_CLASSES[0] and group.key.track == "metric"
+    ]
     group = of_one_target(of_class)[0]
-    rows = [row for row in group.rows if not is_trivial(row) and row.value(row.rank_key) is not None]
+    rows = [
+        row for row in group.rows if not is_trivial(row) and row.value(row.rank_key) is not None
+    ]
     return group, sorted(rows, key=lambda row: (row.value(row.rank_key), row.short_name))
 
 
 def by_charge(group: Group, row: Ranked, charge_mm: np.ndarray) -> np.ndarray:
     """The two-sided MAE of a row at other charges, in mm: it is linear in them."""
     error, missing, invented = (
-        row.value(key) or 0.0 for key in ("two_sided_mae_mm", "object_missing_share", "invented_share")
+        row.value(key) or 0.0
+        for key in ("two_sided_mae_mm", "object_missing_share", "invented_share")
     )
     charged = missing + invented
     return error - (group.key.charge_mm or 0.0) * charged + charge_mm * charged
@@ -108,11 +129,19 @@ def charge_curves() -> bytes:
         errors = by_charge(group, row, CHARGES_MM)
         style = ("-", "--")[number // len(LINE_COLOURS) % 2]
         panel.plot(
-            CHARGES_MM, errors, style, color=LINE_COLOURS[number % len(LINE_COLOURS)], label=row.short_name, **LINE
+            CHARGES_MM,
+            errors,
+            style,
+            color=LINE_COLOURS[number % len(LINE_COLOURS)],
+            label=row.short_name,
+            **LINE,
         )
     panel.axvline(group.key.charge_mm or 0.0, linestyle=":", color="0.5", label="the leaderboard's")
     panel.set(
-        xscale="log", yscale="log", xlabel="charge for a missed or invented pixel, mm", ylabel="two-sided MAE, mm"
+        xscale="log",
+        yscale="log",
+        xlabel="charge for a missed or invented pixel, mm",
+        ylabel="two-sided MAE, mm",
     )
     return with_legend(drawn, 3)
 
@@ -156,24 +185,31 @@ def rows_table(names: Sequence[str], keys: Sequence[str]) -> str:
     """The Markdown between the markers."""
     entries = [read_entry(SHIPPED_ROWS / f"{name}.json") for name in names]
     shown = Table("Method", numbers=[title_of(key) for key in keys])
-    for entry, short in zip(entries, short_names([entry.row.submission for entry in entries]), strict=True):
+    for entry, short in zip(
+        entries, short_names([entry.row.submission for entry in entries]), strict=True
+    ):
         shown.add_row(short, *(three_digits(value_of(entry, key)) for key in keys))
     return "\n".join(["", *shown.markdown(), ""])
 
 
 def with_tables(page: str) -> str:
     """The text of a page with its tables made again."""
-    return _TABLE.sub(lambda found: f"{found[1]}\n{rows_table(found[2].split(), found[3].split())}\n{found[4]}", page)
+    return _TABLE.sub(
+        lambda found: f"{found[1]}\n{rows_table(found[2].split(), found[3].split())}\n{found[4]}",
+        page,
+    )
 
 
 def wrong_figures(page: str) -> list[str]:
-    """A line for each figure of a page that is not its row's, rounded to the digits that are shown."""
+    """A line for each figure of a page that is not its row's, rounded to the digits that are
+    shown."""
     lines = []
     for texts, name, keys in _FIGURE.findall(page):
         entry = read_entry(SHIPPED_ROWS / f"{name}.json")
         shown, wanted = texts.split(" / "), keys.split(" / ")
         rounded = [
-            f"{value_of(entry, key):.{len(text.partition('.')[2])}f}" for key, text in zip(wanted, shown, strict=False)
+            f"{value_of(entry, key):.{len(text.partition('.')[2])}f}"
+            for key, text in zip(wanted, shown, strict=False)
         ]
         if rounded != shown:
             lines.append(f"{texts} of {name}: the row has {' / '.join(rounded)}")
@@ -182,7 +218,9 @@ def wrong_figures(page: str) -> list[str]:
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--check", action="store_true", help="make nothing; exit status 1 where something is older")
+    parser.add_argument(
+        "--check", action="store_true", help="make nothing; exit status 1 where something is older"
+    )
     check, found = parser.parse_args(words).check, []
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         before = path.read_text(encoding="utf-8")

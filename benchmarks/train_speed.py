@@ -3,21 +3,26 @@
     python benchmarks/train_speed.py [--size PX] [--width N] [--network unet] [--batch 4] [--objects 8] [--epochs 5]
     python benchmarks/train_speed.py --quick
 
-At the paper's scale on a GPU (960 px, width 64), at the cpu preset's on a processor (224 px, width 8).
+At the paper's scale on a GPU (960 px, width 64), at the cpu preset's on a processor (224 px, width
+8).
 
-Both train the same network from the same weights with RMSE and RMSprop on the same images, which it builds and exports
-itself (``fpp-bench build``, ``fpp-bench export --mat``), each in its own process, in turns, epoch by epoch.
+Both train the same network from the same weights with RMSE and RMSprop on the same images, which it
+builds and exports itself (``fpp-bench build``, ``fpp-bench export --mat``), each in its own
+process, in turns, epoch by epoch.
 
-- ours: the engine itself (`fpp_ml_bench.baselines.training.engine`) on the memory-mapped Arrow files; on a GPU with
-  bfloat16, channels_last and torch.compile as the paper's preset says, on a processor in float32.
-- plain: torch's ``Dataset`` and ``DataLoader`` over PNG (cv2) and .mat (scipy), torch's default settings, float32,
-  ``loss.item()`` after every step. With ``--loader-workers N`` once more with that many reading processes.
+- ours: the engine itself (`fpp_ml_bench.baselines.training.engine`) on the memory-mapped Arrow
+  files; on a GPU with bfloat16, channels_last and torch.compile as the paper's preset says, on a
+  processor in float32.
+- plain: torch's ``Dataset`` and ``DataLoader`` over PNG (cv2) and .mat (scipy), torch's default
+  settings, float32, ``loss.item()`` after every step. With ``--loader-workers N`` once more with
+  that many reading processes.
 - ours, in torch's default layout: what channels_last gains.
 
-"epoch" is the time of whole epochs without synchronisation, in ms a step; the ratio is taken of it. "data" and
-"compute" come from further epochs, in which the GPU is synchronised after each part. Medians over epochs without the
-first, which compiles and fills caches. "loss" is that of the last epoch and shows that both learn alike. "GiB" is the
-GPU's peak of allocated memory, or the process's peak on a CPU.
+"epoch" is the time of whole epochs without synchronisation, in ms a step; the ratio is taken of it.
+"data" and "compute" come from further epochs, in which the GPU is synchronised after each part.
+Medians over epochs without the first, which compiles and fills caches. "loss" is that of the last
+epoch and shows that both learn alike. "GiB" is the GPU's peak of allocated memory, or the process's
+peak on a CPU.
 """
 
 import argparse
@@ -53,7 +58,8 @@ QUICK = {"size": 224, "width": 8, "objects": 2, "epochs": 2}
 
 
 class Job(NamedTuple):
-    """Settings of a process: ``data`` is the dataset for our engine, the exported tree for the plain loop."""
+    """Settings of a process: ``data`` is the dataset for our engine, the exported tree for the
+    plain loop."""
 
     data: Path
     scratch: Path
@@ -66,7 +72,8 @@ class Job(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """Seconds a step, the epoch's mean loss, GiB. ``data`` and ``compute`` are 0 where they were not timed apart."""
+    """Seconds a step, the epoch's mean loss, GiB. ``data`` and ``compute`` are 0 where they were
+    not timed apart."""
 
     step: float
     data: float
@@ -108,7 +115,9 @@ class Plain:
         torch.manual_seed(42)
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.network = build_network(job.network, width=job.width).to(self.device)
-        self.optimizer = torch.optim.RMSprop(self.network.parameters(), lr=1e-4, alpha=0.99, weight_decay=1e-5)
+        self.optimizer = torch.optim.RMSprop(
+            self.network.parameters(), lr=1e-4, alpha=0.99, weight_decay=1e-5
+        )
         self.loader: DataLoader = DataLoader(
             PngAndMat(job.data), batch_size=job.batch, shuffle=True, num_workers=job.loader_workers
         )
@@ -126,7 +135,8 @@ class Plain:
 
 
 class PngAndMat(Dataset[tuple[torch.Tensor, torch.Tensor]]):
-    """The published tree's training pairs, one file each: fringe / 255 and individually normalised depth."""
+    """The published tree's training pairs, one file each: fringe / 255 and individually normalised
+    depth."""
 
     def __init__(self, tree: Path) -> None:
         split = tree / TRAINING / VARIANT_FOLDERS["individual"] / PUBLISHED_SPLIT_FOLDERS["train"]
@@ -222,17 +232,30 @@ def run_epoch(apart: bool) -> Epoch:
 
 
 def make_data(scratch: Path, size: int, count: int) -> tuple[Path, Path]:
-    """The same samples as a dataset folder and as the published tree: ``count`` training objects of six views."""
+    """The same samples as a dataset folder and as the published tree: ``count`` training objects of
+    six views."""
     training = [name for name in OBJECTS if split_of(name) == "train"][:count]
     objects = ",".join([*training, VALIDATION_OBJECTS[0]])
     dataset, tree = scratch / "dataset", scratch / "tree"
     command = [sys.executable, "-m", "fpp_ml_bench"]
     root = Path(__file__).resolve().parent.parent
     for arguments in (
-        ["build", "--out", dataset, "--size", size, "--objects", objects, "--config", "single_shot"],
+        [
+            "build",
+            "--out",
+            dataset,
+            "--size",
+            size,
+            "--objects",
+            objects,
+            "--config",
+            "single_shot",
+        ],
         ["export", dataset, "--out", tree, "--mat"],
     ):
-        completed = subprocess.run([*command, *map(str, arguments)], cwd=root, capture_output=True, text=True)
+        completed = subprocess.run(
+            [*command, *map(str, arguments)], cwd=root, capture_output=True, text=True
+        )
         if completed.returncode:
             raise SystemExit(f"fpp-bench {arguments[0]} failed:\n{completed.stderr}")
     return dataset, tree
@@ -243,10 +266,15 @@ def check_same(dataset: Path, tree: Path) -> None:
     ours, plain = FringeDepthDataset(dataset, "train", range_rule="object"), PngAndMat(tree)
     names = {path.stem: index for index, path in enumerate(plain.fringes)}
     if len(ours) != len(plain):
-        raise SystemExit(f"the dataset holds {len(ours)} training pairs, the exported tree {len(plain)}")
+        raise SystemExit(
+            f"the dataset holds {len(ours)} training pairs, the exported tree {len(plain)}"
+        )
     for index, sample in enumerate(ours.samples):
         pair, (fringe, depth) = ours[index], plain[names[sample]]
-        if not (torch.allclose(pair.fringe, fringe, atol=1e-6) and torch.allclose(pair.depth, depth, atol=1e-6)):
+        if not (
+            torch.allclose(pair.fringe, fringe, atol=1e-6)
+            and torch.allclose(pair.depth, depth, atol=1e-6)
+        ):
             raise SystemExit(f"{sample}: the two ways read different numbers")
 
 
@@ -270,11 +298,17 @@ def compare(args: argparse.Namespace, scratch: Path) -> None:
                 epoch = pool.submit(run_epoch, split).result()
                 if records is not None:
                     records[index].append(epoch)
-    columns = "".join(f"{column:>10s}" for column in ("epoch", "data", "compute", "loss", "GiB", "faster"))
+    columns = "".join(
+        f"{column:>10s}" for column in ("epoch", "data", "compute", "loss", "GiB", "faster")
+    )
     print(f"\n{'ms a step':34s}{columns}")
     first = median(whole[0], "step")
     for (name, *_), epochs, parts in zip(loops, whole, apart, strict=True):
-        step, data, compute = median(epochs, "step"), median(parts, "data"), median(parts, "compute")
+        step, data, compute = (
+            median(epochs, "step"),
+            median(parts, "data"),
+            median(parts, "compute"),
+        )
         print(
             f"{name:34s}{1e3 * step:10.1f}{1e3 * data:10.1f}{1e3 * compute:10.1f}{parts[-1].loss:10.4f}"
             f"{parts[-1].memory_gib:10.2f}{first / step:9.2f}x"
@@ -290,15 +324,29 @@ def median(epochs: list[Epoch], part: str) -> float:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--network", choices=("unet", "resunet", "hformer"), default="unet")
-    parser.add_argument("--size", type=int, help="image width and height in px (default: 960, or 224 without a GPU)")
-    parser.add_argument("--width", type=int, help="width of the network (default: 64, or 8 without a GPU)")
+    parser.add_argument(
+        "--size", type=int, help="image width and height in px (default: 960, or 224 without a GPU)"
+    )
+    parser.add_argument(
+        "--width", type=int, help="width of the network (default: 64, or 8 without a GPU)"
+    )
     parser.add_argument("--batch", type=int, default=4)
-    parser.add_argument("--objects", type=int, default=8, help="training objects, six pairs each (default: 8)")
-    parser.add_argument("--epochs", type=int, default=5, help="epochs measured of each kind (default: 5)")
-    parser.add_argument("--threads", type=int, help="of torch on the processor (default: torch's own)")
-    parser.add_argument("--loader-workers", type=int, default=0, help="also a plain loop with N reading processes")
+    parser.add_argument(
+        "--objects", type=int, default=8, help="training objects, six pairs each (default: 8)"
+    )
+    parser.add_argument(
+        "--epochs", type=int, default=5, help="epochs measured of each kind (default: 5)"
+    )
+    parser.add_argument(
+        "--threads", type=int, help="of torch on the processor (default: torch's own)"
+    )
+    parser.add_argument(
+        "--loader-workers", type=int, default=0, help="also a plain loop with N reading processes"
+    )
     parser.add_argument("--quick", action="store_true", help=f"rough, in a minute: {QUICK}")
     args = parser.parse_args()
     scale = GPU if torch.cuda.is_available() else CPU
@@ -306,7 +354,11 @@ def main() -> int:
     vars(args).update({**scale, **options, **(QUICK if args.quick else {})})
 
     machine = describe_hardware()
-    where = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{machine.cpu}, {machine.cores} cores"
+    where = (
+        torch.cuda.get_device_name()
+        if torch.cuda.is_available()
+        else f"{machine.cpu}, {machine.cores} cores"
+    )
     print(f"{where}; torch {torch.__version__}, {args.threads or torch.get_num_threads()} threads")
     print(f"{args.network} of width {args.width}, {args.size} px, batches of {args.batch}")
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as scratch:

@@ -1,5 +1,6 @@
-"""Upkeep of what the repository shows of the leaderboard: its rows, the list of those that are vouched for, README's
-table and the tables of docs/results/robustness.md. Every step is a command of the package, printed before it runs.
+"""Upkeep of what the repository shows of the leaderboard: its rows, the list of those that are
+vouched for, README's table and the tables of docs/results/robustness.md. Every step is a command of
+the package, printed before it runs.
 
     python benchmarks/upkeep.py rows data/full --work rows-work          every row of that dataset
     python benchmarks/upkeep.py measured leaderboard/rows/phase-horizontal.json reliance phase data/full
@@ -7,22 +8,28 @@ table and the tables of docs/results/robustness.md. Every step is a command of t
     python benchmarks/upkeep.py robustness results
     python benchmarks/upkeep.py commands [--check]
 
-rows: predict, time, score on the test split, and write a row file and its line in ``leaderboard/vouched.txt`` for each
-method. At 960 px rows are scored against the exact depth, which is the same whatever is projected, and at 224 px
-against ``depth``, as the paper's networks are. A dataset without a training split is the set of unseen objects; its
-rows are called ``NAME-unseen.json``, and ``--suffix=-hard`` names those of another light. One with crossed fringes has
-the methods for them. The same data gives the same scores; times depend on the machine. Phase reliance and robustness,
-which other commands measured, stay in the row of a method that has not changed.
+rows: predict, time, score on the test split, and write a row file and its line in
+``leaderboard/vouched.txt`` for each method. At 960 px rows are scored against the exact depth,
+which is the same whatever is projected, and at 224 px against ``depth``, as the paper's networks
+are. A dataset without a training split is the set of unseen objects; its rows are called
+``NAME-unseen.json``, and ``--suffix=-hard`` names those of another light. One with crossed fringes
+has the methods for them. The same data gives the same scores; times depend on the machine. Phase
+reliance and robustness, which other commands measured, stay in the row of a method that has not
+changed.
 
-measured: run ``fpp-bench reliance`` or ``fpp-bench robustness`` with ``--into ROW``, and keep the row vouched for.
+measured: run ``fpp-bench reliance`` or ``fpp-bench robustness`` with ``--into ROW``, and keep the
+row vouched for.
 
-readme: write the block between README's markers from the rows; with ``--check`` only say whether it is up to date.
+readme: write the block between README's markers from the rows; with ``--check`` only say whether it
+is up to date.
 
-robustness: the tables and curves of every whole result that holds a block of ``test`` or ``unseen`` (`Robustness`), the
-least error first. The leaderboard's rows hold it in brief, without the severities. The tables go between the markers
-``<!-- SET:begin -->`` and ``<!-- SET:end -->`` of the page, and the curves of ``test`` beside it.
+robustness: the tables and curves of every whole result that holds a block of ``test`` or ``unseen``
+(`Robustness`), the least error first. The leaderboard's rows hold it in brief, without the
+severities. The tables go between the markers ``<!-- SET:begin -->`` and ``<!-- SET:end -->`` of the
+page, and the curves of ``test`` beside it.
 
-commands: write docs/commands.md from the commands themselves; with ``--check`` only say whether it is up to date.
+commands: write docs/commands.md from the commands themselves; with ``--check`` only say whether it
+is up to date.
 """
 
 import argparse
@@ -70,7 +77,11 @@ from fpp_ml_bench.style import millimetres, percent
 from fpp_ml_bench.tables import Table, markdown_text
 
 ROOT = Path(__file__).resolve().parent.parent
-ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs/results/robustness.md"
+ROWS, README, ROBUSTNESS = (
+    ROOT / "leaderboard" / "rows",
+    ROOT / "README.md",
+    ROOT / "docs/results/robustness.md",
+)
 COMMANDS = ROOT / "docs" / "commands.md"
 REFUSED, OUTDATED = 2, 1
 
@@ -103,21 +114,23 @@ METHODS = {
     "constant-range-training": "constant --at range-training",
     "nearest": "nearest",
 }
-"""File name of a row: method and options. The trivial methods that are given the range are scored by the rules of the
-paper's networks. The middle of the working range is the standoff, so it is no row of its own."""
+"""File name of a row: method and options. The trivial methods that are given the range are scored
+by the rules of the paper's networks. The middle of the working range is the standoff, so it is no
+row of its own."""
 CROSSED = {
     "crossed": "crossed",
     "crossed-03": "crossed --frames 3",
     "crossed-net": "crossed-net",
     "fringe-net-crossed": "fringe-net",
 }
-"""The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be the same rows."""
+"""The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be
+the same rows."""
 COARSE = {
     "phase-horizontal-36px": "phase --direction horizontal",
     "fringe-net-horizontal-36px": "fringe-net --fringes horizontal",
 }
-"""The same for ``--pitch 36 --config single_shot``: the finest single fringe with one period in the working range, as
-``fpp-bench patterns paper --design`` names it."""
+"""The same for ``--pitch 36 --config single_shot``: the finest single fringe with one period in the
+working range, as ``fpp-bench patterns paper --design`` names it."""
 
 
 def run(command: str, *words: object) -> None:
@@ -129,14 +142,24 @@ def run(command: str, *words: object) -> None:
         sys.exit(status)
 
 
-def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, training: Path | None) -> None:
+def make_row(
+    dataset: Path, work: Path, row: Path, name: str, repeats: int, training: Path | None
+) -> None:
     """Predictions, time, result and row of a setting."""
     predictions, result = work / name, work / f"{name}.json"
     method, *options = (METHODS | CROSSED | COARSE)[name].split()
     options += ["--training", str(training)] if training is not None and method == "nearest" else []
     settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
-    run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
+    run(
+        "fpp-bench",
+        "time",
+        *settings,
+        "--repeats",
+        repeats,
+        "--into",
+        predictions / "submission.yaml",
+    )
     target = "depth_exact" if DatasetFolder(dataset).size[0] == FULL_SIZE else "depth"
     mode = "paper" if name.startswith("constant-range") else "standard"
     run("fpp-eval", predictions, dataset, "--target", target, "--mode", mode, "--json", result)
@@ -147,17 +170,33 @@ def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, trai
 
 
 def keep_measured(before: Entry | None, row: Path) -> None:
-    """Write the reliance and robustness of ``before`` into the row again, if it is of the same method."""
+    """Write the reliance and robustness of ``before`` into the row again, if it is of the same
+    method."""
     if before is None or _method_of(before) != _method_of(read_entry(row)):
         return
     made = read_entry(row).row
-    write_row(made.model_copy(update={key: getattr(before.row, key) for key in ("reliance", "robustness")}), row)
+    write_row(
+        made.model_copy(
+            update={key: getattr(before.row, key) for key in ("reliance", "robustness")}
+        ),
+        row,
+    )
 
 
 def vouch(row: Path, dataset: Path, name: str, before: Entry | None) -> None:
-    """The line of the row in the ``vouched.txt`` above it, in place of that of the row before it."""
+    """The line of the row in the ``vouched.txt`` above it, in place of that of the row before
+    it."""
     suffix = row.stem.removeprefix(name)
-    words = ["python", "benchmarks/upkeep.py", "rows", str(dataset), "--work", "rows-work", "--only", name]
+    words = [
+        "python",
+        "benchmarks/upkeep.py",
+        "rows",
+        str(dataset),
+        "--work",
+        "rows-work",
+        "--only",
+        name,
+    ]
     words += [f"--suffix={suffix}"] if suffix not in ("", "-unseen") else []
     line = vouching_line(read_entry(row).row, row.read_bytes(), "measured", shlex.join(words))
     listed = row.parent.parent / VOUCHED.name
@@ -168,7 +207,8 @@ def vouch(row: Path, dataset: Path, name: str, before: Entry | None) -> None:
 
 
 def write_measured(row: Path, words: Sequence[str]) -> None:
-    """Run ``fpp-bench`` with these words and ``--into`` the row, which stays vouched for if it was."""
+    """Run ``fpp-bench`` with these words and ``--into`` the row, which stays vouched for if it
+    was."""
     before = sha256(row.read_bytes()).hexdigest()
     run("fpp-bench", *words, "--into", row)
     listed = row.parent.parent / VOUCHED.name
@@ -183,8 +223,8 @@ def _method_of(entry: Entry) -> tuple[object, ...]:
 
 
 def filled(path: Path, blocks: Mapping[str, str]) -> str:
-    """The text of ``path`` with each block between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``. SubmissionError
-    where these are not there, each once."""
+    """The text of ``path`` with each block between ``<!-- NAME:begin -->`` and ``<!-- NAME:end
+    -->``. SubmissionError where these are not there, each once."""
     try:
         text = path.read_bytes().decode("utf-8")
     except UnicodeDecodeError:
@@ -193,8 +233,14 @@ def filled(path: Path, blocks: Mapping[str, str]) -> str:
         begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
         before, _, rest = text.partition(begin)
         between, _, after = rest.partition(end)
-        if f"{before}{begin}{between}{end}{after}" != text or text.count(begin) != 1 or text.count(end) != 1:
-            raise SubmissionError(f"{path}: expected {begin} and below it {end}, each once; put them where it belongs")
+        if (
+            f"{before}{begin}{between}{end}{after}" != text
+            or text.count(begin) != 1
+            or text.count(end) != 1
+        ):
+            raise SubmissionError(
+                f"{path}: expected {begin} and below it {end}, each once; put them where it belongs"
+            )
         text = f"{before}{begin}\n\n{block}\n{end}{after}"
     return text
 
@@ -220,9 +266,10 @@ _COLUMNS = (
 
 
 def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
-    """What README shows of the first dataset's metric track, against exact depth where a row is: the `SHOWN` methods of
-    one frame with the least two-sided MAE, without trivial ones, and the best classical method with its full sequence.
-    Only rows that the maintainers vouch for count, and where there are none, results of this machine."""
+    """What README shows of the first dataset's metric track, against exact depth where a row is:
+    the `SHOWN` methods of one frame with the least two-sided MAE, without trivial ones, and the
+    best classical method with its full sequence. Only rows that the maintainers vouch for count,
+    and where there are none, results of this machine."""
     first = [
         group
         for group in groups
@@ -230,9 +277,13 @@ def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
     ]
     shown = []
     for frames, count in ((FRAMES_CLASSES[0], SHOWN), (FRAMES_CLASSES[-1], 1)):
-        of_class = [group for group in first if group.key.frames == frames and group.key.track == "metric"]
+        of_class = [
+            group for group in first if group.key.frames == frames and group.key.track == "metric"
+        ]
         for group in of_one_target(of_class)[:1]:
-            rows = [row for row in group.rows if row.provenance != SELF_REPORTED and not is_trivial(row)]
+            rows = [
+                row for row in group.rows if row.provenance != SELF_REPORTED and not is_trivial(row)
+            ]
             rows = [row for row in rows if row.entry.vouched or not group.vouched]
             rows = [row for row in rows if row.value(row.rank_key) is not None]
             if frames == FRAMES_CLASSES[-1]:
@@ -243,24 +294,35 @@ def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
 
 
 def readme_block(groups: Sequence[Group]) -> str:
-    """What is between README's markers: a table of `readme_rows`, and a line that says how to read it."""
+    """What is between README's markers: a table of `readme_rows`, and a line that says how to read
+    it."""
     if not (shown := readme_rows(groups) if groups else []):
         return f"No row yet. {_MADE_BY}\n"
     (group, first), rows = shown[0], [row for _, row in shown]
-    machines = sorted({markdown_text(device(row.entry)) for row in rows if row.entry.latency_ms is not None})
+    machines = sorted(
+        {markdown_text(device(row.entry)) for row in rows if row.entry.latency_ms is not None}
+    )
     notes = [
-        f"{group.key.data_title}: {group.parts}, {sum(part.samples for part in first.objects)} samples of "
+        f"{group.key.data_title}: {group.parts}, {sum(part.samples for part in first.objects)} "
+        f"samples of "
         f"{len(first.objects)} objects, against {group.key.against}.",
         f"Two-sided MAE: {columns.TWO_SIDED_NOTE}",
         "Assumes: what must be true of the scene beside the rig's calibration.",
         f"Time: median latency of one image on {' or '.join(machines) or 'an unknown machine'}.",
-        "Phase reliance: 1 if the depth follows the fringe's phase and nothing else, 0 if it does not follow it; then "
+        "Phase reliance: 1 if the depth follows the fringe's phase and nothing else, 0 if it does "
+        "not follow it; then "
         "without errors of whole periods. It does not see a bias.",
         "Disturbed: two-sided MAE over disturbed scenes.",
     ]
-    reported = [f"\\{NOT_CHECKED}: reported by the row's author."] if any(not r.entry.all_checked for r in rows) else []
+    reported = (
+        [f"\\{NOT_CHECKED}: reported by the row's author."]
+        if any(not r.entry.all_checked for r in rows)
+        else []
+    )
     text = " ".join(notes + reported)
-    return "\n".join([*ranking_table("", _COLUMNS, rows).markdown(), "", f"{text} {_MADE_BY}"]) + "\n"
+    return (
+        "\n".join([*ranking_table("", _COLUMNS, rows).markdown(), "", f"{text} {_MADE_BY}"]) + "\n"
+    )
 
 
 CURVES = "robustness_curves.png"
@@ -272,7 +334,8 @@ DRAWN = (
     "Phase, 1 horizontal",
     "Classical 18+Gray, vertical",
 )
-"""The rows whose curves are drawn: four methods of one frame, and the classical one; more lines can't be told apart."""
+"""The rows whose curves are drawn: four methods of one frame, and the classical one; more lines
+can't be told apart."""
 SCORES = ("wrong_share", "confident_share", "coverage")
 TITLES = (
     "method",
@@ -292,7 +355,9 @@ Row = tuple[str, Robustness]
 
 def of_set(name: SetName, results: Sequence[Result]) -> list[Row]:
     """Names and blocks of a set, the least error first."""
-    blocks = [(result, block) for result in results if (block := (result.robustness or {}).get(name))]
+    blocks = [
+        (result, block) for result in results if (block := (result.robustness or {}).get(name))
+    ]
     names = short_names([result.submission for result, _ in blocks])
     found = [
         (f"{short}, {block.size_px} px" if block.size_px != FULL_SIZE else short, block)
@@ -308,7 +373,11 @@ def held_out() -> list[str]:
 
 def robustness_tables(rows: Sequence[Row]) -> str:
     """Both tables in Markdown: means over all axes, then each axis by itself."""
-    axes = [axis for axis in corruptions().axes if any(axis in block.axes | block.beside for _, block in rows)]
+    axes = [
+        axis
+        for axis in corruptions().axes
+        if any(axis in block.axes | block.beside for _, block in rows)
+    ]
     titles = [*TITLES[1:5], *held_out(), *TITLES[5:]]
     overall, by_axis = Table(TITLES[0], numbers=titles), Table("method", numbers=axes)
     for name, block in rows:
@@ -318,20 +387,31 @@ def robustness_tables(rows: Sequence[Row]) -> str:
         numbers = [f"{block.mae_mm:.1f}", interval, f"{block.clean.mae_mm:.1f}", ratio]
         mask = [percent(block.mean(key), 2) for key in ("unanswered_share", "invented_share")]
         answered = millimetres(block.mean("answered_mae_mm"))
-        errors = {axis: [one.mae_mm for one in found] for axis, found in (block.axes | block.beside).items()}
+        errors = {
+            axis: [one.mae_mm for one in found]
+            for axis, found in (block.axes | block.beside).items()
+        }
         marks = {axis: "*" if axis in block.drawn else "" for axis in errors}
-        apart = [f"{sum(errors[axis]) / 5:.1f}{marks[axis]}" if axis in errors else "" for axis in held_out()]
-        overall.add_row(name, *numbers, *apart, *mask, answered, *(percent(block.mean(key)) for key in SCORES))
+        apart = [
+            f"{sum(errors[axis]) / 5:.1f}{marks[axis]}" if axis in errors else ""
+            for axis in held_out()
+        ]
+        overall.add_row(
+            name, *numbers, *apart, *mask, answered, *(percent(block.mean(key)) for key in SCORES)
+        )
         by_axis.add_row(
             name,
             *(
-                f"{sum(errors[axis]) / 5:.1f}, {errors[axis][-1]:.1f}{marks[axis]}" if axis in errors else ""
+                f"{sum(errors[axis]) / 5:.1f}, {errors[axis][-1]:.1f}{marks[axis]}"
+                if axis in errors
+                else ""
                 for axis in axes
             ),
         )
     between = [
         "",
-        f"Not in the mean: {', '.join(name for name, axis in corruptions().axes.items() if axis.beside)}. "
+        f"Not in the mean: "
+        f"{', '.join(name for name, axis in corruptions().axes.items() if axis.beside)}. "
         "\\*: the lights that the method learned from disturb this too.",
         "",
         "By axis, mean over the five severities and the last one, mm:",
@@ -341,9 +421,12 @@ def robustness_tables(rows: Sequence[Row]) -> str:
 
 
 def curves(rows: Sequence[Row]) -> bytes:
-    """The curves of `DRAWN` on the test objects as the page of ``fpp-bench robustness`` draws them; PNG."""
+    """The curves of `DRAWN` on the test objects as the page of ``fpp-bench robustness`` draws them;
+    PNG."""
     measured = []
-    for title, block in sorted((row for row in rows if row[0] in DRAWN), key=lambda row: DRAWN.index(row[0])):
+    for title, block in sorted(
+        (row for row in rows if row[0] in DRAWN), key=lambda row: DRAWN.index(row[0])
+    ):
         means = {
             axis: dict(enumerate((s.model_dump() for s in found), 1))
             for axis, found in (block.axes | block.beside).items()
@@ -365,11 +448,16 @@ made by `python benchmarks/upkeep.py commands`.
 
 
 def commands_page() -> str:
-    """docs/commands.md: each command's usage, sentence and first `EXAMPLES`, by program and group."""
+    """docs/commands.md: each command's usage, sentence and first `EXAMPLES`, by program and
+    group."""
     parts = [_COMMANDS_HEAD]
     for program in (BENCH, EVAL):
         for group, commands in program.groups.items():
-            parts.append(f"## {program.name}: {group}\n" if len(program.groups) > 1 else f"## {program.name}\n")
+            parts.append(
+                f"## {program.name}: {group}\n"
+                if len(program.groups) > 1
+                else f"## {program.name}\n"
+            )
             for name in commands:
                 parts += _command_parts(f"{program.name} {name}", program.command(name))
     return "\n".join(parts)
@@ -392,14 +480,25 @@ def _command_parts(name: str, command: Any) -> Iterator[str]:
 def parser() -> argparse.ArgumentParser:
     """Of the words after the script's name."""
     summary = __doc__.split("\n\n", 1)[0]
-    words = argparse.ArgumentParser(description=summary, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    words = argparse.ArgumentParser(
+        description=summary, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     jobs = words.add_subparsers(dest="job", required=True)
     add = jobs.add_parser("rows", help="make rows again").add_argument
     add("dataset", type=Path, help="dataset folder with all frames")
     add("--work", type=Path, required=True, help="new or empty folder for predictions and results")
     add("--out", type=Path, default=ROWS, help="folder for the rows")
-    add("--only", nargs="+", choices=METHODS | CROSSED | COARSE, metavar="NAME", help="only these rows")
-    add("--suffix", help="of the rows' names (default: -unseen for a dataset without a training split)")
+    add(
+        "--only",
+        nargs="+",
+        choices=METHODS | CROSSED | COARSE,
+        metavar="NAME",
+        help="only these rows",
+    )
+    add(
+        "--suffix",
+        help="of the rows' names (default: -unseen for a dataset without a training split)",
+    )
     add("--training", type=Path, help="for nearest: the dataset with the training split")
     add("--repeats", type=int, default=40, help="timed runs of each method")
     add = jobs.add_parser("measured", help="measure reliance or robustness of a row").add_argument
@@ -407,11 +506,21 @@ def parser() -> argparse.ArgumentParser:
     add("words", nargs=argparse.REMAINDER, help="words of fpp-bench, without --into")
     add = jobs.add_parser("readme", help="write README's table").add_argument
     add("page", type=Path, nargs="?", default=README, help="Markdown with the markers")
-    add("--check", action="store_true", help="write nothing; exit status 1 where it is not up to date")
+    add(
+        "--check",
+        action="store_true",
+        help="write nothing; exit status 1 where it is not up to date",
+    )
     add = jobs.add_parser("commands", help="write docs/commands.md").add_argument
     add("page", type=Path, nargs="?", default=COMMANDS, help="Markdown file")
-    add("--check", action="store_true", help="write nothing; exit status 1 where it is not up to date")
-    add = jobs.add_parser("robustness", help="write the tables of docs/results/robustness.md").add_argument
+    add(
+        "--check",
+        action="store_true",
+        help="write nothing; exit status 1 where it is not up to date",
+    )
+    add = jobs.add_parser(
+        "robustness", help="write the tables of docs/results/robustness.md"
+    ).add_argument
     add("results", type=Path, nargs="+", help="result files, or folders of them")
     add("--page", type=Path, default=ROBUSTNESS, help="Markdown with the markers")
     return words
@@ -424,21 +533,31 @@ def make_rows(args: argparse.Namespace) -> None:
     args.work.mkdir(parents=True, exist_ok=True)
     args.out.mkdir(parents=True, exist_ok=True)
     opened = DatasetFolder(args.dataset)
-    suffix = args.suffix if args.suffix is not None else "" if "train" in opened.splits else "-unseen"
+    suffix = (
+        args.suffix if args.suffix is not None else "" if "train" in opened.splits else "-unseen"
+    )
     plain = METHODS if opened.rig.pitch("horizontal") == PAPER_PITCH_PX else COARSE
     for name in args.only or (plain if opened.rig.crossed is None else CROSSED):
-        make_row(args.dataset, args.work, args.out / f"{name}{suffix}.json", name, args.repeats, args.training)
+        make_row(
+            args.dataset,
+            args.work,
+            args.out / f"{name}{suffix}.json",
+            name,
+            args.repeats,
+            args.training,
+        )
 
 
 def write_readme(page: Path, groups: Sequence[Group], check: bool) -> int:
-    """Write the block of ``groups``; with ``check`` only say whether it is there, by the exit status."""
+    """Write the block of ``groups``; with ``check`` only say whether it is there, by the exit
+    status."""
     text = filled(page, {"leaderboard": readme_block(groups)})
     return write_made(page, text, check, "the ranking", "the rows", "readme")
 
 
 def write_made(page: Path, text: str, check: bool, what: str, source: str, job: str) -> int:
-    """Write ``text``, which ``job`` made of ``source``; with ``check`` only say whether the page has it, by the exit
-    status."""
+    """Write ``text``, which ``job`` made of ``source``; with ``check`` only say whether the page
+    has it, by the exit status."""
     same = page.is_file() and text.encode() == page.read_bytes()
     if check and not same:
         print(
@@ -470,7 +589,9 @@ def main(words: Sequence[str] | None = None) -> int:
         if args.job == "readme":
             return write_readme(args.page, rank(read_entries(shipped_rows())), args.check)
         if args.job == "commands":
-            return write_made(args.page, commands_page(), args.check, "the page", "the commands", "commands")
+            return write_made(
+                args.page, commands_page(), args.check, "the page", "the commands", "commands"
+            )
         if args.job == "measured":
             write_measured(args.row, args.words)
         elif args.job == "rows":

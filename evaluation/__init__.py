@@ -1,5 +1,5 @@
-"""Evaluation: scores of depth maps, checked predictions in, `result.json` out. The rules are in PROTOCOL.md.
-``DepthScores`` is the torch metric of a training loop."""
+"""Evaluation: scores of depth maps, checked predictions in, `result.json` out. The rules are in
+PROTOCOL.md. ``DepthScores`` is the torch metric of a training loop."""
 
 
 def __getattr__(name: str) -> object:

@@ -1,9 +1,10 @@
-"""The metrics: an entry says everything about one. From the entries come the result model and its JSON Schema, the
-table of PROTOCOL.md, the reports, the columns and the sort keys of the leaderboard, and the metric of the training.
+"""The metrics: an entry says everything about one. From the entries come the result model and its
+JSON Schema, the table of PROTOCOL.md, the reports, the columns and the sort keys of the
+leaderboard, and the metric of the training.
 
-To add one, write an entry here and give PROTOCOL.md the table of `protocol_table`; no other file changes. Its function
-gets a `fpp_ml_bench.evaluation.score.SampleScores`: prediction, target and masks of a sample, its errors on the object,
-and the statistics that the built-in metrics share.
+To add one, write an entry here and give PROTOCOL.md the table of `protocol_table`; no other file
+changes. Its function gets a `fpp_ml_bench.evaluation.score.SampleScores`: prediction, target and
+masks of a sample, its errors on the object, and the statistics that the built-in metrics share.
 """
 
 import math
@@ -24,19 +25,21 @@ WIDE, WIDEST = 140, 170
 
 @dataclass(frozen=True)
 class Metric:
-    """``of`` computes it for a sample, None where the sample has no pixel for it, or names a statistic that a sample
-    has; ``title`` and ``rule`` say what it is in reports and in PROTOCOL.md. The order of the entries is that of the
-    keys in a file and of all tables.
+    """``of`` computes it for a sample, None where the sample has no pixel for it, or names a
+    statistic that a sample has; ``title`` and ``rule`` say what it is in reports and in
+    PROTOCOL.md. The order of the entries is that of the keys in a file and of all tables.
 
-    ``optional``: a file leaves its key out where no sample has it, so that files from before the entry stay readable;
-    else it is null. ``charged``: rules without a charge for missing and invented pixels don't have it. ``cancels``: a
-    small difference of large numbers, which two machines compute to 1e-9 of the error.
+    ``optional``: a file leaves its key out where no sample has it, so that files from before the
+    entry stay readable; else it is null. ``charged``: rules without a charge for missing and
+    invented pixels don't have it. ``cancels``: a small difference of large numbers, which two
+    machines compute to 1e-9 of the error.
 
-    Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``: ``rank``, the
-    leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering
-    fewer pixels, so nothing is sorted by it; ``training``: `DepthScores` has it; ``over``: it is null exactly where
-    this pixel set is empty; ``column``: title of its column in the leaderboard's tables, in terminals of
-    ``column_from`` characters and more; ``terminal``: title of its column in the tables of ``fpp-eval``."""
+    Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``:
+    ``rank``, the leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``:
+    a method improves it by answering fewer pixels, so nothing is sorted by it; ``training``:
+    `DepthScores` has it; ``over``: it is null exactly where this pixel set is empty; ``column``:
+    title of its column in the leaderboard's tables, in terminals of ``column_from`` characters and
+    more; ``terminal``: title of its column in the tables of ``fpp-eval``."""
 
     key: str
     title: str
@@ -69,10 +72,14 @@ def share(part: Any, whole: Any) -> Any:
 def _mae(pixels: str, title: str, where: str, error: str = "mae", **about: Any) -> Metric:
     """The MAE over a set of pixels, or another ``error`` that `ErrorStats` has."""
     name, statistic = error.upper(), f"{pixels.removeprefix('object_')}.{error}_mm"
-    return Metric(f"{pixels}_{error}_mm", f"{title} {name}", "mm", statistic, f"{name} over {where}", **about)
+    return Metric(
+        f"{pixels}_{error}_mm", f"{title} {name}", "mm", statistic, f"{name} over {where}", **about
+    )
 
 
-def _errors(pixels: str, title: str, where: str, mae: Any = None, rmse: Any = None, **about: Any) -> tuple[Metric, ...]:
+def _errors(
+    pixels: str, title: str, where: str, mae: Any = None, rmse: Any = None, **about: Any
+) -> tuple[Metric, ...]:
     """MAE and RMSE over a set of pixels; ``mae`` and ``rmse``: what only one of them has."""
     both = {"mae": mae or {}, "rmse": rmse or {}}
     return tuple(_mae(pixels, title, where, error, **about, **own) for error, own in both.items())
@@ -168,7 +175,9 @@ _ENTRIES = (
         methodcaller("quantile", 0.95),
         "95th percentile of |e|, linear interpolation",
     ),
-    _object("object_max_mm", "Object, largest error", "mm", methodcaller("quantile", 1.0), "largest |e|"),
+    _object(
+        "object_max_mm", "Object, largest error", "mm", methodcaller("quantile", 1.0), "largest |e|"
+    ),
     *(
         _object(
             f"object_within_{limit}mm_share",
@@ -210,7 +219,12 @@ _ENTRIES = (
         cancels=True,
         helped_by_missing=True,
     ),
-    _mae("object_wide_band", f"Object within {WIDE_BAND_PX} px of edges,", "the object wide band", optional=False),
+    _mae(
+        "object_wide_band",
+        f"Object within {WIDE_BAND_PX} px of edges,",
+        "the object wide band",
+        optional=False,
+    ),
     _mae(
         "object_wide_interior",
         f"Object {WIDE_BAND_PX} px or more from edges,",
@@ -231,7 +245,8 @@ _ENTRIES = (
         "Two-sided MAE",
         "mm",
         methodcaller("two_sided_mm"),
-        "sum of |e| over the measured pixels, and of the charge for each object pixel that is not measured and each "
+        "sum of |e| over the measured pixels, and of the charge for each object pixel that is not "
+        "measured and each "
         "background pixel predicted above 0, over the object's pixels",
         charged=True,
         role="rank",
@@ -262,12 +277,19 @@ _ENTRIES = (
         "void_share",
         "Void, share of the image",
         "share",
-        lambda s: None if s.void is None else s.void / (s.object.pixels + s.background.pixels + s.void),
+        lambda s: (
+            None if s.void is None else s.void / (s.object.pixels + s.background.pixels + s.void)
+        ),
         "void pixels over all pixels of the image",
         better="neither",
     ),
     *_errors("unlit", "Unlit,", "the unlit set, missing pixels included", over="unlit"),
-    _mae("unlit_valid", "Unlit where predicted,", "the measured pixels of the unlit set", helped_by_missing=True),
+    _mae(
+        "unlit_valid",
+        "Unlit where predicted,",
+        "the measured pixels of the unlit set",
+        helped_by_missing=True,
+    ),
     Metric(
         "unlit_missing_share",
         "Unlit, not predicted",
@@ -281,7 +303,8 @@ _ENTRIES = (
         "Object MAE, share of its depth range",
         "ratio",
         lambda s: share(s.object.mae_mm, s.range_mm),
-        "object MAE over (D_max - D_min) of the object pixels that are scored; may exceed 1; none for a flat object",
+        "object MAE over (D_max - D_min) of the object pixels that are scored; may exceed 1; none "
+        "for a flat object",
         training=True,
         role="range",
     ),
@@ -289,8 +312,11 @@ _ENTRIES = (
 METRICS = {metric.key: metric for metric in _ENTRIES}
 """Every metric by its key, in the order of a file."""
 HEADLINE = tuple(key for key, metric in METRICS.items() if metric.headline)
-"""The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the background, in mm."""
-RANK_KEY, RANGE_KEY = (next(m.key for m in _ENTRIES if m.role == role) for role in ("rank", "range"))
+"""The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the
+background, in mm."""
+RANK_KEY, RANGE_KEY = (
+    next(m.key for m in _ENTRIES if m.role == role) for role in ("rank", "range")
+)
 OBJECT_KEY = "object_mae_mm"
 """What rows are ranked by where nothing is charged: the paper's rules."""
 RANKED = (*HEADLINE, RANK_KEY)
@@ -307,7 +333,12 @@ BOUNDS = (
     ("object_valid_bias_mm", "object_valid_mae_mm", 1.0, _BIAS),
     ("object_shift_free_mae_mm", "object_mae_mm", 1.0, _BIAS),
     *(
-        (key, key.replace("_mae_", "_rmse_"), 1.0, f"{key.split('_mae')[0]} RMSE is below its MAE, which no error has")
+        (
+            key,
+            key.replace("_mae_", "_rmse_"),
+            1.0,
+            f"{key.split('_mae')[0]} RMSE is below its MAE, which no error has",
+        )
         for key in METRICS
         if key.replace("_mae_", "_rmse_") in METRICS.keys() - {key}
     ),
@@ -317,43 +348,60 @@ BOUNDS = (
     ("object_median_mm", "object_rmse_mm", math.sqrt(2.0), _TAIL),
     ("object_p95_mm", "object_rmse_mm", math.sqrt(20.0), _TAIL),
     *(
-        (f"object_within_{less}mm_share", f"object_within_{more}mm_share", 1.0, "a wider tolerance holds fewer pixels")
+        (
+            f"object_within_{less}mm_share",
+            f"object_within_{more}mm_share",
+            1.0,
+            "a wider tolerance holds fewer pixels",
+        )
         for less, more in pairwise(WITHIN_MM)
     ),
 )
-"""Of any errors, and so of means over samples, the magnitude of the first score is at most so many times the second's;
-what is said where it is not."""
+"""Of any errors, and so of means over samples, the magnitude of the first score is at most so many
+times the second's; what is said where it is not."""
 MIXTURES = (
     ("object_mae_mm", "object_edge_mae_mm", "object_interior_mae_mm", "object_edge_share"),
     ("object_rmse_mm", "object_edge_rmse_mm", "object_interior_rmse_mm", "object_edge_share"),
-    ("object_mae_mm", "object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share"),
+    (
+        "object_mae_mm",
+        "object_wide_band_mae_mm",
+        "object_wide_interior_mae_mm",
+        "object_wide_band_share",
+    ),
     ("object_mae_mm", "", "object_valid_mae_mm", "object_missing_share"),
     ("object_interior_mae_mm", "", "object_interior_valid_mae_mm", "object_interior_missing_share"),
     ("unlit_mae_mm", "", "unlit_valid_mae_mm", "unlit_missing_share"),
 )
-"""The first score is that of a set of two parts, whose errors are the second (empty: any) and the third; the fourth is
-the second part's share of its pixels."""
+"""The first score is that of a set of two parts, whose errors are the second (empty: any) and the
+third; the fourth is the second part's share of its pixels."""
 
 NOTES = (
-    "Two-sided MAE {two_sided_mae_mm} mm, by which the leaderboard ranks: object pixels that are not measured are "
+    "Two-sided MAE {two_sided_mae_mm} mm, by which the leaderboard ranks: object pixels that are "
+    "not measured are "
     "charged, and so is background with an answer, {invented_share} of the object's pixels. "
     "{two_sided_with_void_mae_mm} mm with the void pixels of its surface.",
-    "Object: |error| median {object_median_mm}, 95th percentile {object_p95_mm}, maximum {object_max_mm} mm; pixels "
+    "Object: |error| median {object_median_mm}, 95th percentile {object_p95_mm}, maximum "
+    "{object_max_mm} mm; pixels "
     f"within {', '.join(f'{limit} mm {{object_within_{limit}mm_share}}' for limit in WITHIN_MM)}. "
     "MAE {object_mae_range_share} of each sample's depth range.",
-    "Bias {object_bias_mm} mm ({object_valid_bias_mm} mm where measured); MAE {object_shift_free_mae_mm} mm once each "
+    "Bias {object_bias_mm} mm ({object_valid_bias_mm} mm where measured); MAE "
+    "{object_shift_free_mae_mm} mm once each "
     "sample's best single offset is removed.",
-    f"MAE {{object_wide_band_mae_mm}} mm within {WIDE_BAND_PX} px of depth edges, {{object_wide_interior_mae_mm}} mm "
+    f"MAE {{object_wide_band_mae_mm}} mm within {WIDE_BAND_PX} px of depth edges, "
+    f"{{object_wide_interior_mae_mm}} mm "
     "inside.",
     "Object pixels near a depth edge: {object_edge_share}.",
-    "Object pixels not measured: {object_missing_share} ({object_interior_missing_share} of those away from edges), "
+    "Object pixels not measured: {object_missing_share} ({object_interior_missing_share} of those "
+    "away from edges), "
     "scored with their whole depth. MAE where measured: {object_valid_mae_mm} mm, away from edges "
     "{object_interior_valid_mae_mm} mm.",
     "Void pixels, in no set: {void_share} of the image (unlit, or of mixed depths).",
-    "Unlit pixels: MAE {unlit_mae_mm}, RMSE {unlit_rmse_mm} mm; {unlit_missing_share} not measured, MAE of the others "
+    "Unlit pixels: MAE {unlit_mae_mm}, RMSE {unlit_rmse_mm} mm; {unlit_missing_share} not "
+    "measured, MAE of the others "
     "{unlit_valid_mae_mm} mm.",
 )
-"""What the terminal says below its table; a line whose first score may be left out of a file is left out with it."""
+"""What the terminal says below its table; a line whose first score may be left out of a file is
+left out with it."""
 
 
 _sigma = partial(Metric, helped_by_missing=True, optional=False)
@@ -391,7 +439,8 @@ _STATED = (
         "Negative log-likelihood, nats",
         "nats",
         "nll",
-        "mean over these of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2, with s' = max(s, 0.01 mm)",
+        "mean over these of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2, with s' = max(s, 0.01 "
+        "mm)",
         terminal="NLL",
     ),
     *(
@@ -400,7 +449,8 @@ _STATED = (
             f"AUSE, {error.upper()}",
             "mm",
             methodcaller("area_mm", f"{error}_mm"),
-            f"{error.upper()} without the share x of least sure pixels, minus that without the share x of largest "
+            f"{error.upper()} without the share x of least sure pixels, minus that without the "
+            f"share x of largest "
             "errors; mean over x = 0, 0.05, ... 0.95",
             cancels=True,
             terminal="AUSE\nMAE" if error == "mae" else "",
@@ -428,17 +478,21 @@ _STATED = (
     ),
 )
 UNCERTAINTY = {metric.key: metric for metric in _STATED}
-"""Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result; ``of`` gets a
-`SigmaSample`."""
+"""Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result; ``of``
+gets a `SigmaSample`."""
 
 
 def with_column(width: int) -> list[Metric]:
-    """Those with a column in the leaderboard's tables where the terminal has ``width`` characters, the most important
-    and the errors over the object first."""
+    """Those with a column in the leaderboard's tables where the terminal has ``width`` characters,
+    the most important and the errors over the object first."""
     shown = (metric for metric in METRICS.values() if metric.column and metric.column_from <= width)
 
     def place(metric: Metric) -> tuple[int, bool, bool]:
-        return metric.column_from, metric.role != "rank", not (metric.headline and metric.over == "object")
+        return (
+            metric.column_from,
+            metric.role != "rank",
+            not (metric.headline and metric.over == "object"),
+        )
 
     return sorted(shown, key=place)
 
@@ -454,13 +508,24 @@ _VARIED = re.compile(r"MAE|RMSE|\d+(?= mm|%)")
 
 
 def protocol_table(metrics: Iterable[Metric]) -> list[str]:
-    """Lines of the table in PROTOCOL.md; neighbours of the same rule share a line. Units are in the keys. A direction
-    is named where it is not "lower"."""
-    other = {"lower": "", "higher": " (higher is better)", "nearer 0": " (nearer 0 is better)", "neither": " (neither)"}
+    """Lines of the table in PROTOCOL.md; neighbours of the same rule share a line. Units are in the
+    keys. A direction is named where it is not "lower"."""
+    other = {
+        "lower": "",
+        "higher": " (higher is better)",
+        "nearer 0": " (nearer 0 is better)",
+        "neither": " (neither)",
+    }
     lines = ["| key | rule |", "|---|---|"]
-    for (rule, better), entries in groupby(metrics, lambda m: (_VARIED.sub("{}", m.rule), m.better)):
+    for (rule, better), entries in groupby(
+        metrics, lambda m: (_VARIED.sub("{}", m.rule), m.better)
+    ):
         alike = list(entries)
         values = zip(*(_VARIED.findall(metric.rule) for metric in alike), strict=True)
-        said = rule.format(*(", ".join(dict.fromkeys(options)) for options in values)).replace("|", "\\|")
-        lines.append(f"| {', '.join(f'`{metric.key}`' for metric in alike)} | {said}{other[better]} |")
+        said = rule.format(*(", ".join(dict.fromkeys(options)) for options in values)).replace(
+            "|", "\\|"
+        )
+        lines.append(
+            f"| {', '.join(f'`{metric.key}`' for metric in alike)} | {said}{other[better]} |"
+        )
     return lines

@@ -1,8 +1,10 @@
-"""FPP-ML-Bench: data, strict evaluation, baselines and leaderboard for single-shot fringe projection profilometry.
+"""FPP-ML-Bench: data, strict evaluation, baselines and leaderboard for single-shot fringe
+projection profilometry.
 
-The front door is the seven functions of `fpp_ml_bench.api`. Behind it: ``optics`` and ``decoding`` (rig, patterns,
-phase, triangulation), then the subpackages ``loaders <- evaluation <- baselines <- leaderboard``; each imports only the
-core and those to its left. Nothing heavy is imported until it is used: ``import fpp_ml_bench`` takes milliseconds.
+The front door is the seven functions of `fpp_ml_bench.api`. Behind it: ``optics`` and ``decoding``
+(rig, patterns, phase, triangulation), then the subpackages ``loaders <- evaluation <- baselines <-
+leaderboard``; each imports only the core and those to its left. Nothing heavy is imported until it
+is used: ``import fpp_ml_bench`` takes milliseconds.
 """
 
 import sys as _sys
@@ -14,12 +16,15 @@ from pathlib import Path as _Path
 __version__ = "0.3.0"
 
 _ROOT = _Path(__file__).resolve().parent.parent
-_ROOMS = frozenset(f"{__name__}.{room}" for room in ("loaders", "evaluation", "baselines", "leaderboard"))
+_ROOMS = frozenset(
+    f"{__name__}.{room}" for room in ("loaders", "evaluation", "baselines", "leaderboard")
+)
 
 
 class _Checkout:
-    """Finds the four subpackages of a source checkout, which are folders beside this one, and nothing else there. When
-    the checkout is only the current folder, it shadows an installed wheel; the two must not mix."""
+    """Finds the four subpackages of a source checkout, which are folders beside this one, and
+    nothing else there. When the checkout is only the current folder, it shadows an installed wheel;
+    the two must not mix."""
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> _ModuleSpec | None:
@@ -29,7 +34,16 @@ class _Checkout:
 if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "loaders" / "__init__.py").is_file():
     _sys.meta_path.insert(0, _Checkout)  # type: ignore[arg-type]
 
-__all__ = ["Method", "compare", "decode", "evaluate", "load_dataset", "load_method", "open_dataset", "rank"]
+__all__ = [
+    "Method",
+    "compare",
+    "decode",
+    "evaluate",
+    "load_dataset",
+    "load_method",
+    "open_dataset",
+    "rank",
+]
 
 
 def __getattr__(name: str) -> object:

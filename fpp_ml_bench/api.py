@@ -1,7 +1,7 @@
 """The front door: seven functions that open, decode, score and rank.
 
-Like the commands, this module may import every subpackage; none of them imports it. Each function imports what it needs
-when it is called.
+Like the commands, this module may import every subpackage; none of them imports it. Each function
+imports what it needs when it is called.
 
 >>> import fpp_ml_bench as fpp
 >>> dataset = fpp.open_dataset("data/mini")
@@ -112,7 +112,8 @@ def decode(
     steps: int | None = None,
     mask: "NDArray[np.bool_] | None" = None,
 ) -> "Decoded":
-    """Depth from a captured sequence: N-step phase, Gray-code order, triangulation (paper Section 2.1).
+    """Depth from a captured sequence: N-step phase, Gray-code order, triangulation (paper Section
+    2.1).
 
     Parameters
     ----------
@@ -245,16 +246,28 @@ def evaluate(
     >>> fpp.evaluate(truth + 2.0, truth).metrics.object_mae_mm
     2.0
     """
-    in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units, "nodata": nodata}
+    in_memory = {
+        "flags": flags,
+        "sigma": sigma,
+        "objects": objects,
+        "units": units,
+        "nodata": nodata,
+    }
     in_memory["charge_mm"] = charge_mm
     if not isinstance(predictions, (str, Path)):
         if isinstance(dataset, (str, Path, DatasetFolder)):
-            raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")
+            raise PredictionError(
+                "predictions in memory need the targets as arrays; or give a folder and a dataset"
+            )
         return evaluate_arrays(predictions, dataset, **in_memory, edge_band_px=edge_band_px)
     if given := [name for name, values in in_memory.items() if values is not None]:
-        raise PredictionError(f"{', '.join(given)}: belongs to arrays; a folder of predictions has its own")
+        raise PredictionError(
+            f"{', '.join(given)}: belongs to arrays; a folder of predictions has its own"
+        )
     opened = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
-    return evaluate_folder(predictions, opened, split, target, edge_band_px, mode, say=warnings.warn)
+    return evaluate_folder(
+        predictions, opened, split, target, edge_band_px, mode, say=warnings.warn
+    )
 
 
 def compare(first: "str | Path | Result", second: "str | Path | Result") -> "Comparison":
@@ -285,12 +298,16 @@ def compare(first: "str | Path | Result", second: "str | Path | Result") -> "Com
     """
     from fpp_ml_bench.leaderboard.rows import alike, read_scored
 
-    scored = (read_scored(Path(given)) if isinstance(given, (str, Path)) else given for given in (first, second))
+    scored = (
+        read_scored(Path(given)) if isinstance(given, (str, Path)) else given
+        for given in (first, second)
+    )
     return compare_results(*alike(*scored))
 
 
 def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[Group]":
-    """Result files as ranked groups; only results on the same data and by the same rules stand in one group.
+    """Result files as ranked groups; only results on the same data and by the same rules stand in
+    one group.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """The benchmark's constants, in one place: objects and their split, views, working range, units.
 
-Sources: paper Section 3 (50 objects, 6 views by 60 degrees, 80/10/10 split by object, range 1.5-2.1 m) and the public
-list of its objects. The paper does not list the split; it is defined here, with the four objects of the paper's test
-figures in test.
+Sources: paper Section 3 (50 objects, 6 views by 60 degrees, 80/10/10 split by object, range 1.5-2.1
+m) and the public list of its objects. The paper does not list the split; it is defined here, with
+the four objects of the paper's test figures in test.
 """
 
 import math
@@ -12,10 +12,11 @@ SCHEMA_VERSION = "3.0.0"
 
 TAU = 2 * math.pi
 GOLDEN = 0.6180339887498949
-"""Inverse of the golden ratio. Multiples of it, without their whole part, fill the interval from 0 to 1 evenly."""
+"""Inverse of the golden ratio. Multiples of it, without their whole part, fill the interval from 0
+to 1 evenly."""
 PLASTIC = 0.7548776662466927
-"""Inverse of the plastic number: multiples of it do so too, and with those of its square they fill the plane evenly
-(the sequence R2, Roberts 2018)."""
+"""Inverse of the plastic number: multiples of it do so too, and with those of its square they fill
+the plane evenly (the sequence R2, Roberts 2018)."""
 MM_PER_M = 1000.0
 GREY_LEVELS = 255
 LARGEST_SIDE_PX = 8192
@@ -33,8 +34,8 @@ PUBLISHED_SPLIT_FOLDERS = {"train": "train", "validation": "val", "test": "test"
 VIEW_DEGREES = (0, 60, 120, 180, 240, 300)
 VIEWS = tuple(f"A{degrees}" for degrees in VIEW_DEGREES)
 CONFIGS = ("single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all")
-"""Configurations of a dataset: which frames of a sample are read (paper Section 5.4; ``crossed`` is ours, and only of
-sets with such frames)."""
+"""Configurations of a dataset: which frames of a sample are read (paper Section 5.4; ``crossed`` is
+ours, and only of sets with such frames)."""
 
 OBJECTS = (
     "master_chef_can",
@@ -90,7 +91,13 @@ OBJECTS = (
     "duct_tape",
 )
 
-VALIDATION_OBJECTS = ("mustard_bottle", "mug", "paint_brush_large", "paint_container_jar", "spraygun")
+VALIDATION_OBJECTS = (
+    "mustard_bottle",
+    "mug",
+    "paint_brush_large",
+    "paint_container_jar",
+    "spraygun",
+)
 TEST_OBJECTS = ("power_drill", "magazine_stack", "container_bottle", "wooden_boards", "large_clamp")
 
 UNSEEN = (
@@ -115,10 +122,11 @@ UNSEEN = (
     "wave_plate",
     "wire_loop",
 )
-"""Objects of a second test set, of kinds that are not among `OBJECTS`. It is for measuring, never for choosing."""
+"""Objects of a second test set, of kinds that are not among `OBJECTS`. It is for measuring, never
+for choosing."""
 
-# The mini preset: six objects from all splits, among them the extremes of the test figures (a concave union of parts
-# and the deepest object).
+# The mini preset: six objects from all splits, among them the extremes of the test figures (a
+# concave union of parts and the deepest object).
 MINI_OBJECTS = ("bowl", "cracker_box", "banana", "mug", "power_drill", "wooden_boards")
 MINI_SIZE = 480
 FULL_SIZE = 960
@@ -141,7 +149,9 @@ def split_of(name: str) -> str:
 OBJECT_NAME, VIEW_NAME = re.compile(r"\w[\w-]{0,99}"), re.compile(r"[^\W_]([^\W_]|-){0,99}")
 SAMPLE_NAME = re.compile(f"{OBJECT_NAME.pattern}_{VIEW_NAME.pattern}")
 """Names that a dataset may have; they become names of files."""
-REPOSITORY_NAME = re.compile(r"(?!.*(--|\.\.|\.git$))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
+REPOSITORY_NAME = re.compile(
+    r"(?!.*(--|\.\.|\.git$))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII
+)
 """OWNER/NAME of a repository of the Hugging Face Hub."""
 
 
@@ -151,7 +161,8 @@ def sample_name(name: str, view: str) -> str:
 
 
 def split_sample_name(sample: str) -> tuple[str, str]:
-    """Object and view of a sample name, split at the LAST underscore, because object names contain underscores."""
+    """Object and view of a sample name, split at the LAST underscore, because object names contain
+    underscores."""
     name, _, view = sample.rpartition("_")
     if not name or not view:
         raise ValueError(f"expected a sample name like 'power_drill_A60', got {sample!r}")

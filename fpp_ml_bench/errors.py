@@ -1,4 +1,5 @@
-"""The errors this package raises. A message says what was expected, what came, in which file or sample, and what to do.
+"""The errors this package raises. A message says what was expected, what came, in which file or
+sample, and what to do.
 
 Commands print an `FppBenchError` and exit with status 2.
 """
@@ -17,11 +18,13 @@ class DecodeError(FppBenchError, ValueError):
 
 
 class CaptureError(FppBenchError, ValueError):
-    """Captured images that can't be read as frames, or results of a capture that can't be written."""
+    """Captured images that can't be read as frames, or results of a capture that can't be
+    written."""
 
 
 class CalibrationError(FppBenchError, ValueError):
-    """A board that is not found, or captures that don't determine a rig, or contradict each other."""
+    """A board that is not found, or captures that don't determine a rig, or contradict each
+    other."""
 
 
 class MeshError(FppBenchError, ValueError):
@@ -41,7 +44,8 @@ class BuildError(DatasetError):
 
 
 class PredictionError(FppBenchError, ValueError):
-    """Predictions that can't be scored; ``problems`` holds a line for each wrong or missing prediction."""
+    """Predictions that can't be scored; ``problems`` holds a line for each wrong or missing
+    prediction."""
 
     def __init__(self, summary: str, problems: list[str] | None = None) -> None:
         self.problems = problems or []
@@ -85,4 +89,5 @@ class RemoteError(FppBenchError):
 
 
 class PublishError(FppBenchError):
-    """Data or results that can't be published: no token, no network, refused by the Hub, or incomplete."""
+    """Data or results that can't be published: no token, no network, refused by the Hub, or
+    incomplete."""

@@ -1,5 +1,5 @@
-"""Files of any room: text of unknown origin, the only readers of YAML and JSON from outside, bounded reading, atomic
-writing, hashes, and locks."""
+"""Files of any room: text of unknown origin, the only readers of YAML and JSON from outside,
+bounded reading, atomic writing, hashes, and locks."""
 
 import errno
 import json
@@ -22,20 +22,22 @@ from fpp_ml_bench.errors import BuildError, FppBenchError, PredictionError
 NAME_LIMIT = 200
 """Longest text a submission may hold in any one value, in characters."""
 DEEPEST, LONGEST_NUMBER, MOST_NODES, MOST_VALUES = 64, 1_000, 50_000, 1_000_000
-"""Limits of a file from outside, checked before its values are built: levels of mappings and lists in each other,
-digits of a number, keys and values of YAML, values of JSON."""
+"""Limits of a file from outside, checked before its values are built: levels of mappings and lists
+in each other, digits of a number, keys and values of YAML, values of JSON."""
 LARGEST = 1e100
-"""Magnitude of a number in a file from outside, at most: sums, products and ratios of such numbers stay finite, and no
-length, time or count comes near."""
+"""Magnitude of a number in a file from outside, at most: sums, products and ratios of such numbers
+stay finite, and no length, time or count comes near."""
 CORRECT = "correct the file"
 _PIECE_BYTES = 1 << 18  # of a file that is hashed, at a time: they stay in the processor's cache
 
-# Control, format (bidirectional overrides, zero-width), surrogate, and line or paragraph separators.
+# Control, format (bidirectional overrides, zero-width), surrogate, and line or paragraph
+# separators.
 _FORBIDDEN = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 
 
 def text_problem(value: str, limit: int = NAME_LIMIT) -> str | None:
-    """What is wrong with a one-line text, or None: empty, over ``limit`` characters, or with control characters."""
+    """What is wrong with a one-line text, or None: empty, over ``limit`` characters, or with
+    control characters."""
     if not value.strip():
         return "expected some text, got an empty one"
     if len(value) > limit:
@@ -47,7 +49,8 @@ def text_problem(value: str, limit: int = NAME_LIMIT) -> str | None:
 
 
 def path_problem(path: str) -> str | None:
-    """What is wrong with a text from a file that must be the path of something below a folder, or None."""
+    """What is wrong with a text from a file that must be the path of something below a folder, or
+    None."""
     plain = PurePosixPath(path)
     below = plain.parts and not plain.is_absolute() and ".." not in plain.parts and "\\" not in path
     if below and str(plain) == path:
@@ -61,10 +64,13 @@ def cause_of(error: Exception) -> str:
 
 
 def printable(value: object, limit: int = NAME_LIMIT) -> str:
-    """``value`` as text that is safe in a terminal: control characters escaped, cut at ``limit`` characters."""
+    """``value`` as text that is safe in a terminal: control characters escaped, cut at ``limit``
+    characters."""
     text = value if isinstance(value, str) else repr(value)
     escaped = "".join(
-        c if unicodedata.category(c) not in _FORBIDDEN else c.encode("unicode_escape", "backslashreplace").decode()
+        c
+        if unicodedata.category(c) not in _FORBIDDEN
+        else c.encode("unicode_escape", "backslashreplace").decode()
         for c in text[:limit]
     )
     return escaped + ("..." if len(text) > limit else "")
@@ -72,13 +78,18 @@ def printable(value: object, limit: int = NAME_LIMIT) -> str:
 
 @contextmanager
 def opened(path: Path, links: bool = False) -> Iterator[tuple[IO[bytes], int]]:
-    """The file and its size in bytes; PredictionError, without the file's name, for anything but a regular file, and
-    without ``links`` for a symbolic link. Opening never waits, as for the other end of a pipe."""
+    """The file and its size in bytes; PredictionError, without the file's name, for anything but a
+    regular file, and without ``links`` for a symbolic link. Opening never waits, as for the other
+    end of a pipe."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | (0 if links else os.O_NOFOLLOW))
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         linked = not links and path.is_symlink()
-        reason = "is a symbolic link; put the file itself there" if linked else f"can't be read: {cause_of(error)}"
+        reason = (
+            "is a symbolic link; put the file itself there"
+            if linked
+            else f"can't be read: {cause_of(error)}"
+        )
         raise PredictionError(reason) from None
     info = os.fstat(descriptor)
     if not stat.S_ISREG(info.st_mode):
@@ -90,8 +101,8 @@ def opened(path: Path, links: bool = False) -> Iterator[tuple[IO[bytes], int]]:
 
 
 def visible(folder: Path, raised: type[FppBenchError]) -> list[Path]:
-    """The entries of a folder by name, but those whose name begins with a dot. Raises ``raised`` for a folder that
-    can't be read."""
+    """The entries of a folder by name, but those whose name begins with a dot. Raises ``raised``
+    for a folder that can't be read."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:
@@ -99,7 +110,8 @@ def visible(folder: Path, raised: type[FppBenchError]) -> list[Path]:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; False for a name that no file can have, for which ``Path.is_file`` raises an error."""
+    """Whether there is a file; False for a name that no file can have, for which ``Path.is_file``
+    raises an error."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -107,15 +119,19 @@ def is_file(path: Path) -> bool:
 
 
 def fill(stream: IO[Any], view: memoryview) -> int:
-    """Fill ``view`` from the stream; the number of bytes read, fewer where the stream ends early."""
+    """Fill ``view`` from the stream; the number of bytes read, fewer where the stream ends
+    early."""
     done = 0
     while count := stream.readinto(view[done:]):  # type: ignore[attr-defined]
         done += count
     return done
 
 
-def read_bounded(path: Path, limit: int, cure: str = "write a map of this size again", links: bool = False) -> bytes:
-    """All bytes of the file at ``path``. Raises PredictionError as `opened`, or when they are more than ``limit``."""
+def read_bounded(
+    path: Path, limit: int, cure: str = "write a map of this size again", links: bool = False
+) -> bytes:
+    """All bytes of the file at ``path``. Raises PredictionError as `opened`, or when they are more
+    than ``limit``."""
     with opened(path, links) as (stream, size):
         if size > limit:
             raise PredictionError(f"has {size} bytes, expected at most {limit} bytes; {cure}")
@@ -127,26 +143,37 @@ def read_bounded(path: Path, limit: int, cure: str = "write a map of this size a
 
 
 def file_content(path: Path, limit: int, raised: type[FppBenchError], cure: str = CORRECT) -> bytes:
-    """All bytes, at most ``limit``, of a file that the user names; a link is followed. Raises ``raised`` with the
-    file's name, the problem and the ``cure``."""
+    """All bytes, at most ``limit``, of a file that the user names; a link is followed. Raises
+    ``raised`` with the file's name, the problem and the ``cure``."""
     try:
         return read_bounded(path, limit, cure, links=True)
     except PredictionError as error:
         raise raised(f"{printable(str(path), 500)}: {error}") from None
 
 
-def read_yaml(path: Path, raised: type[FppBenchError], cure: str = CORRECT, limit: int = 1 << 20) -> Any:
-    """The plain values of a YAML file, as `strict_yaml`; ``raised`` with file, problem and ``cure``."""
+def read_yaml(
+    path: Path, raised: type[FppBenchError], cure: str = CORRECT, limit: int = 1 << 20
+) -> Any:
+    """The plain values of a YAML file, as `strict_yaml`; ``raised`` with file, problem and
+    ``cure``."""
     return _read(path, strict_yaml, "plain YAML", raised, cure, limit)
 
 
-def read_json(path: Path, raised: type[FppBenchError], cure: str = CORRECT, limit: int = 1 << 26) -> Any:
-    """The plain values of a JSON file, as `strict_json`; ``raised`` with file, problem and ``cure``."""
+def read_json(
+    path: Path, raised: type[FppBenchError], cure: str = CORRECT, limit: int = 1 << 26
+) -> Any:
+    """The plain values of a JSON file, as `strict_json`; ``raised`` with file, problem and
+    ``cure``."""
     return _read(path, strict_json, "valid JSON", raised, cure, limit)
 
 
 def _read(
-    path: Path, parse: Callable[[str], Any], form: str, raised: type[FppBenchError], cure: str, limit: int
+    path: Path,
+    parse: Callable[[str], Any],
+    form: str,
+    raised: type[FppBenchError],
+    cure: str,
+    limit: int,
 ) -> Any:
     content, file = file_content(path, limit, raised, cure), printable(str(path), 500)
     try:
@@ -164,7 +191,8 @@ DISK_FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Have an `OSError` within name ``path``, and that of a full disk, which names no file, say what to do."""
+    """Have an `OSError` within name ``path``, and that of a full disk, which names no file, say
+    what to do."""
     try:
         yield
     except OSError as error:
@@ -180,10 +208,10 @@ UNFINISHED = r"\.[0-9a-f]{16}\.tmp"
 
 @contextmanager
 def whole_file(path: Path, sync: bool = True) -> Iterator[IO[bytes]]:
-    """A new file to be written within, which becomes ``path`` at the end, and is removed after an error: it is there
-    complete or not at all, with ``sync`` (which takes milliseconds) also after a power cut. Its name until then can't
-    be guessed, and no link is followed: in a folder that others write to, nobody can plant one. An `OSError` names
-    ``path``."""
+    """A new file to be written within, which becomes ``path`` at the end, and is removed after an
+    error: it is there complete or not at all, with ``sync`` (which takes milliseconds) also after a
+    power cut. Its name until then can't be guessed, and no link is followed: in a folder that
+    others write to, nobody can plant one. An `OSError` names ``path``."""
     temporary = path.with_name(f".{token_hex(8)}.tmp")
     with naming(path):
         try:
@@ -207,15 +235,18 @@ def write_atomically(path: Path, content: bytes, sync: bool = True) -> None:
 def whole_folder(
     out: Path, activity: str, error_type: type[FppBenchError], empty: str = "give a new folder"
 ) -> Iterator[Path]:
-    """A folder to write into, which becomes ``out`` when the block succeeds, and is removed when it fails. What a
-    killed process left of one is removed. Raises ``error_type`` where ``out`` is not empty (with what to do then), is a
-    file, is being written by another process, or can't be written."""
+    """A folder to write into, which becomes ``out`` when the block succeeds, and is removed when it
+    fails. What a killed process left of one is removed. Raises ``error_type`` where ``out`` is not
+    empty (with what to do then), is a file, is being written by another process, or can't be
+    written."""
     target = out.resolve()
     if target.is_dir() and any(target.iterdir()):
         raise error_type(f"{out}: is not empty; {empty}")
     staging = target.with_name(f".{target.name}.unfinished")
     if staging.is_symlink():
-        raise error_type(f"{staging}: is a link, and this command needs a folder of that name; remove it")
+        raise error_type(
+            f"{staging}: is a link, and this command needs a folder of that name; remove it"
+        )
     with exclusive(staging / LOCK_FILE, out, activity, error_type):
         content = staging / "files"
         try:
@@ -225,22 +256,27 @@ def whole_folder(
             content.replace(target)
         except OSError as error:
             raise error_type(
-                f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
+                f"{out}: can't be written ({error.strerror or error}); nothing was left there. "
+                f"Free some "
                 "space or choose another disk"
             ) from error
         finally:
             shutil.rmtree(staging, ignore_errors=True)
 
 
-def write_files(folder: Path, contents: Mapping[str, bytes], error_type: type[FppBenchError]) -> list[Path]:
-    """Write ``contents`` by file name into ``folder``, which is made if it is missing; returns their paths. Raises
-    ``error_type`` for a folder that can't be written."""
+def write_files(
+    folder: Path, contents: Mapping[str, bytes], error_type: type[FppBenchError]
+) -> list[Path]:
+    """Write ``contents`` by file name into ``folder``, which is made if it is missing; returns
+    their paths. Raises ``error_type`` for a folder that can't be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in contents.items():
             write_atomically(folder / name, content)
     except OSError as error:
-        raise error_type(f"{folder}: can't be written ({error.strerror or error}); choose another folder") from error
+        raise error_type(
+            f"{folder}: can't be written ({error.strerror or error}); choose another folder"
+        ) from error
     return [folder / name for name in contents]
 
 
@@ -249,14 +285,17 @@ def holds(folder: Path, contents: Mapping[str, bytes]) -> bool:
     if not folder.is_dir() or {path.name for path in folder.iterdir()} != contents.keys():
         return False
     try:
-        return all(read_bounded(folder / name, len(content)) == content for name, content in contents.items())
+        return all(
+            read_bounded(folder / name, len(content)) == content
+            for name, content in contents.items()
+        )
     except PredictionError:  # longer, or no file
         return False
 
 
 def file_hash(path: Path) -> str:
-    """XXH3 128-bit hash of a file's bytes, hex. Read and not mapped: a file that is cut meanwhile has another hash, and
-    would end a process that maps it."""
+    """XXH3 128-bit hash of a file's bytes, hex. Read and not mapped: a file that is cut meanwhile
+    has another hash, and would end a process that maps it."""
     import xxhash
 
     digest, piece = xxhash.xxh3_128(), memoryview(bytearray(_PIECE_BYTES))
@@ -267,18 +306,21 @@ def file_hash(path: Path) -> str:
 
 
 def check_space(needed: Mapping[Path, int], needing: str, cure: str) -> None:
-    """Raise `BuildError` for a disk that has less free space than all folders on it need, in bytes. ``needing``: what
-    needs them, and the verb."""
+    """Raise `BuildError` for a disk that has less free space than all folders on it need, in bytes.
+    ``needing``: what needs them, and the verb."""
     places, sizes = dict[int, Path](), Counter[int]()
     for folder, size in needed.items():
-        there = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+        there = next(
+            parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists()
+        )
         sizes[there.stat().st_dev] += size
         places.setdefault(there.stat().st_dev, there)
     for device, size in sizes.items():
         there = places[device]
         if size > (free := shutil.disk_usage(there).free):
             raise BuildError(
-                f"{there}: the disk has {free / 1e9:.2f} GB free, and {needing} about {size / 1e9:.2f} GB there; "
+                f"{there}: the disk has {free / 1e9:.2f} GB free, and {needing} about "
+                f"{size / 1e9:.2f} GB there; "
                 f"free some space, or choose another disk{cure}"
             )
 
@@ -291,9 +333,9 @@ LOCK_FILE = ".lock"
 def exclusive(
     lock_file: Path, folder: Path, activity: str, error_type: type[FppBenchError] = BuildError
 ) -> Iterator[None]:
-    """Hold ``lock_file``, created with its folder if absent and removed at the end; ``error_type`` for a ``folder``
-    that is a file, can't be written or that another process has. The operating system releases the lock when the
-    process ends in any way."""
+    """Hold ``lock_file``, created with its folder if absent and removed at the end; ``error_type``
+    for a ``folder`` that is a file, can't be written or that another process has. The operating
+    system releases the lock when the process ends in any way."""
     import filelock
 
     if folder.exists() and not folder.is_dir():
@@ -303,7 +345,9 @@ def exclusive(
         lock_file.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except filelock.Timeout:
-        raise error_type(f"{folder}: another process is {activity}; wait for it or choose another folder") from None
+        raise error_type(
+            f"{folder}: another process is {activity}; wait for it or choose another folder"
+        ) from None
     except OSError as error:
         raise error_type(f"{folder}: can't be written ({error.strerror or error})") from error
     held = lock_file.stat()
@@ -323,26 +367,36 @@ def _strict_loader() -> type:
     import yaml
 
     class StrictLoader(yaml.SafeLoader):
-        """SafeLoader without aliases, tags and duplicate keys, of bounded size, with 1e-3 read as the number it is and
-        2026-01-31 as text."""
+        """SafeLoader without aliases, tags and duplicate keys, of bounded size, with 1e-3 read as
+        the number it is and 2026-01-31 as text."""
 
         nodes = depth = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
-            event, key = self.peek_event(), f" {printable(index.value, 60)}:" if hasattr(index, "value") else ""
+            event, key = (
+                self.peek_event(),
+                f" {printable(index.value, 60)}:" if hasattr(index, "value") else "",
+            )
             where = f"line {event.start_mark.line + 1}:{key}"
             if isinstance(event, yaml.events.AliasEvent):
                 raise yaml.YAMLError(f"{where} uses an alias (*); write the value out")
             if event.tag is not None:
-                raise yaml.YAMLError(f"{where} has the tag {printable(event.tag, 60)}; write a plain value")
+                raise yaml.YAMLError(
+                    f"{where} has the tag {printable(event.tag, 60)}; write a plain value"
+                )
             self.nodes, self.depth = self.nodes + 1, self.depth + 1
             if self.nodes > MOST_NODES:
                 raise yaml.YAMLError(f"{where} expected at most {MOST_NODES} keys and values")
             if self.depth > DEEPEST:
-                raise yaml.YAMLError(f"{where} nested too deeply, expected at most {DEEPEST} levels")
+                raise yaml.YAMLError(
+                    f"{where} nested too deeply, expected at most {DEEPEST} levels"
+                )
             node: Any = super().compose_node(parent, index)
             self.depth -= 1
-            if node.tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float") and len(node.value) > LONGEST_NUMBER:
+            if (
+                node.tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+                and len(node.value) > LONGEST_NUMBER
+            ):
                 raise yaml.YAMLError(f"{where} a number of more than {LONGEST_NUMBER} digits")
             return node
 
@@ -362,18 +416,23 @@ def _strict_loader() -> type:
         for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
     StrictLoader.add_implicit_resolver(
-        "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+        "tag:yaml.org,2002:float",
+        re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"),
+        list("-+0123456789"),
     )
     return StrictLoader
 
 
 def strict_yaml(text: str) -> Any:
-    """The plain values of a YAML text. Raises ValueError, fit to print, for anything else: also for an alias, a tag, a
-    key given twice, a number beyond `LARGEST`, and for more or deeper values than `MOST_NODES` and `DEEPEST`."""
+    """The plain values of a YAML text. Raises ValueError, fit to print, for anything else: also for
+    an alias, a tag, a key given twice, a number beyond `LARGEST`, and for more or deeper values
+    than `MOST_NODES` and `DEEPEST`."""
     import yaml
 
     try:
-        content = yaml.load(text, _strict_loader())  # a subclass of SafeLoader: builds plain values only
+        content = yaml.load(
+            text, _strict_loader()
+        )  # a subclass of SafeLoader: builds plain values only
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         lines = str(error).replace('"<unicode string>", ', "").splitlines()
         raise ValueError(" ".join(printable(line.strip()) for line in lines)) from None
@@ -385,8 +444,9 @@ _JSON_TEXT = re.compile(r'"(?:[^"\\]|\\.)*+"', re.DOTALL)
 
 
 def strict_json(text: str) -> Any:
-    """The plain values of a JSON text. Raises ValueError, fit to print, for anything else: also for a key given twice,
-    NaN, a number beyond `LARGEST`, and for more or deeper values than `MOST_VALUES` and `DEEPEST`."""
+    """The plain values of a JSON text. Raises ValueError, fit to print, for anything else: also for
+    a key given twice, NaN, a number beyond `LARGEST`, and for more or deeper values than
+    `MOST_VALUES` and `DEEPEST`."""
     if not text.strip():
         raise ValueError("it is empty")
     bare = _JSON_TEXT.sub("", text)
@@ -421,7 +481,8 @@ def _whole(text: str) -> int:
 
 
 def _check_values(value: Any, where: str = "") -> None:
-    """Refuse what neither format can say but its readers accept: NaN, half a character; numbers beyond `LARGEST`."""
+    """Refuse what neither format can say but its readers accept: NaN, half a character; numbers
+    beyond `LARGEST`."""
     if isinstance(value, dict):
         for key, entry in value.items():
             _check_values(key, where)
@@ -432,7 +493,15 @@ def _check_values(value: Any, where: str = "") -> None:
     elif isinstance(value, int | float) and not abs(value) <= LARGEST:
         number = printable(json.dumps(value), 60)
         raise ValueError(
-            f"{printable(where) or 'the file'}: {number} is no number; expected a finite one up to {LARGEST:g}"
+            f"{printable(where) or 'the file'}: {number} is no number; expected a finite one up to "
+            f"{LARGEST:g}"
         )
-    elif isinstance(value, str) and not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
-        raise ValueError(f"{printable(where) or 'the file'}: half of a surrogate pair; write the character itself")
+    elif (
+        isinstance(value, str)
+        and not value.isascii()
+        and any("\ud800" <= letter <= "\udfff" for letter in value)
+    ):
+        raise ValueError(
+            f"{printable(where) or 'the file'}: half of a surrogate pair; write the character "
+            f"itself"
+        )

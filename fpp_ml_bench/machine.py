@@ -1,5 +1,5 @@
-"""This machine and this process: its hardware, threads and memory, and how kernels are compiled. Imports neither NumPy
-nor torch."""
+"""This machine and this process: its hardware, threads and memory, and how kernels are compiled.
+Imports neither NumPy nor torch."""
 
 import ctypes
 import gc
@@ -25,8 +25,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 @dataclass(frozen=True)
 class Hardware:
-    """``cores`` and ``memory_gib`` are what this process may use (affinity, container limits), not what is built in;
-    ``gpu`` names all visible NVIDIA GPUs, None without any."""
+    """``cores`` and ``memory_gib`` are what this process may use (affinity, container limits), not
+    what is built in; ``gpu`` names all visible NVIDIA GPUs, None without any."""
 
     cpu: str
     cores: int
@@ -39,11 +39,14 @@ class Hardware:
 
 
 def describe_hardware() -> Hardware:
-    """Describe this machine. Never raises; an unavailable value is ``"unknown"``, 0.0 GiB or None."""
+    """Describe this machine. Never raises; an unavailable value is ``"unknown"``, 0.0 GiB or
+    None."""
     model = _found(r"^model name\s*:\s*(.+)$", "/proc/cpuinfo")
     memory_gib = round(_usable_memory_bytes() / 1024.0**3, 1)
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
-    return Hardware(model or platform.processor() or "unknown", usable_cores(), memory_gib, _gpu_names(), system)
+    return Hardware(
+        model or platform.processor() or "unknown", usable_cores(), memory_gib, _gpu_names(), system
+    )
 
 
 def _read(path: str) -> str:
@@ -60,8 +63,11 @@ def _found(pattern: str, path: str) -> str | None:
 
 
 def usable_cores() -> int:
-    """CPUs in the affinity mask, or fewer where the container's quota (cgroup v2 ``cpu.max``) allows less."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """CPUs in the affinity mask, or fewer where the container's quota (cgroup v2 ``cpu.max``)
+    allows less."""
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     quota = re.match(r"(\d+) (\d+)", _read("/sys/fs/cgroup/cpu.max"))
     if quota and int(quota.group(2)) > 0:
         cores = min(cores, max(1, round(int(quota.group(1)) / int(quota.group(2)))))
@@ -75,7 +81,8 @@ def _usable_memory_bytes() -> float:
 
 
 def _gpu_names() -> str | None:
-    """NVIDIA GPUs, from the driver's files, from torch if it is loaded already, or from ``nvidia-smi``."""
+    """NVIDIA GPUs, from the driver's files, from torch if it is loaded already, or from
+    ``nvidia-smi``."""
     files = sorted(Path("/proc/driver/nvidia/gpus").glob("*/information"))
     names = [name for file in files if (name := _found(r"^Model:\s*(.+)$", str(file))) is not None]
     torch = sys.modules.get("torch")
@@ -86,7 +93,9 @@ def _gpu_names() -> str | None:
 
         command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
         try:
-            listing = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout
+            listing = subprocess.run(
+                command, capture_output=True, text=True, timeout=10, check=True
+            ).stdout
         except (OSError, subprocess.SubprocessError):
             listing = ""
         names = [line.strip() for line in listing.splitlines() if line.strip()]
@@ -100,8 +109,8 @@ def limit_threads(threads: int) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep what is freed, up to 2 GiB (Linux only): every image and training step asks for the same sizes
-    again, and the page faults of new memory take longer than the arithmetic."""
+    """Have glibc keep what is freed, up to 2 GiB (Linux only): every image and training step asks
+    for the same sizes again, and the page faults of new memory take longer than the arithmetic."""
     set_option = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if set_option is not None:
         set_option(_MMAP_THRESHOLD, 1 << 30)
@@ -109,8 +118,9 @@ def keep_freed_memory() -> None:
 
 
 def prepare_process() -> None:
-    """Keep freed memory, look for no pydantic plugins (a search of every installed package), and collect no cyclic
-    garbage: the collector visits every imported object again and again, and scoring leaves no reference cycles."""
+    """Keep freed memory, look for no pydantic plugins (a search of every installed package), and
+    collect no cyclic garbage: the collector visits every imported object again and again, and
+    scoring leaves no reference cycles."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.disable()
     keep_freed_memory()
@@ -128,13 +138,15 @@ def _numba() -> Any:
 
 @cache
 def _code_cache() -> Any:
-    """Numba's cache of machine code, where a file that is damaged or can't be written is as if there were none."""
+    """Numba's cache of machine code, where a file that is damaged or can't be written is as if
+    there were none."""
     from hashlib import sha256
 
     from numba.core.caching import FunctionCache, IndexDataCacheFile
 
     class SealedFile(IndexDataCacheFile):
-        """With a digest behind each pickle, which ignores it: damaged machine code would end the process."""
+        """With a digest behind each pickle, which ignores it: damaged machine code would end the
+        process."""
 
         def _dump(self, obj: object) -> bytes:
             content: bytes = super()._dump(obj)
@@ -168,20 +180,24 @@ def _code_cache() -> Any:
 
 
 def njit(function: Function) -> Function:
-    """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba it stays as it is,
-    and is slow. No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes
-    on every processor and for any number of threads."""
+    """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba
+    it stays as it is, and is slow. No ``fastmath``, and no multiplication is fused with an
+    addition: the same input gives the same bytes on every processor and for any number of
+    threads."""
     if _numba() is None:
         return function
     compiled = _numba().njit(nogil=True, error_model="numpy")(function)
-    with suppress(RuntimeError):  # neither the package folder nor the user's cache folder can be written
+    with suppress(
+        RuntimeError
+    ):  # neither the package folder nor the user's cache folder can be written
         compiled._cache = _code_cache()(function)
     return cast(Function, compiled)
 
 
 @contextmanager
 def single_threaded_algebra() -> Iterator[None]:
-    """Worker processes started inside the block get a single-threaded BLAS, whose idle threads would spin otherwise."""
+    """Worker processes started inside the block get a single-threaded BLAS, whose idle threads
+    would spin otherwise."""
     previous = {name: os.environ[name] for name in THREAD_COUNTS if name in os.environ}
     os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
     try:

@@ -1,4 +1,5 @@
-"""Options that describe themselves: fields of a dataclass which carry their help, for the command line and the docs.
+"""Options that describe themselves: fields of a dataclass which carry their help, for the command
+line and the docs.
 
 >>> from dataclasses import dataclass
 >>> @dataclass(frozen=True)
@@ -24,10 +25,11 @@ REQUIRED: Any = MISSING
 
 @dataclass(frozen=True)
 class Description:
-    """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are (a
-    ``Literal`` annotation says them itself), and ``flag``, its spelling where that is not made of the field's name.
-    ``parse`` makes a value of its text where the field's type does not say how; it raises ValueError with what it
-    expected. ``many``: may be given again, the field is a tuple. ``positional``: an argument without a flag."""
+    """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices``
+    that there are (a ``Literal`` annotation says them itself), and ``flag``, its spelling where
+    that is not made of the field's name. ``parse`` makes a value of its text where the field's type
+    does not say how; it raises ValueError with what it expected. ``many``: may be given again, the
+    field is a tuple. ``positional``: an argument without a flag."""
 
     help: str
     metavar: str | None = None
@@ -47,22 +49,33 @@ def option(
     parse: Callable[[str], Any] | None = None,
     many: bool = False,
 ) -> Any:
-    """A dataclass field that is an option of the command line: its ``default``, and the rest as of `Description`."""
+    """A dataclass field that is an option of the command line: its ``default``, and the rest as of
+    `Description`."""
     description = Description(help, metavar, tuple(choices), flag, parse, many)
     return field(default=default, metadata={_KEY: description})
 
 
 def argument(
-    help: str, metavar: str, default: Any = REQUIRED, choices: Collection[str] = (), many: bool = False
+    help: str,
+    metavar: str,
+    default: Any = REQUIRED,
+    choices: Collection[str] = (),
+    many: bool = False,
 ) -> Any:
-    """A dataclass field that is an argument of the command line, given by its position; else as `option`."""
+    """A dataclass field that is an argument of the command line, given by its position; else as
+    `option`."""
     description = Description(help, metavar, tuple(choices), many=many, positional=True)
     return field(default=default, metadata={_KEY: description})
 
 
 def options_of(settings: Any) -> "list[Field[Any]]":
-    """The fields of a dataclass that are options of the command line, in order; its other fields are for code alone."""
-    return [entry for entry in (fields(settings) if is_dataclass(settings) else ()) if _KEY in entry.metadata]
+    """The fields of a dataclass that are options of the command line, in order; its other fields
+    are for code alone."""
+    return [
+        entry
+        for entry in (fields(settings) if is_dataclass(settings) else ())
+        if _KEY in entry.metadata
+    ]
 
 
 def described(entry: "Field[Any]") -> Description:
@@ -77,12 +90,14 @@ def flag_of(entry: "Field[Any]") -> str:
 
 
 def nearest(name: str, known: Collection[str] | Mapping[str, Any], count: int = 1) -> list[str]:
-    """The known names, at most ``count``, that an unknown ``name`` is probably meant as; none that is far from it."""
+    """The known names, at most ``count``, that an unknown ``name`` is probably meant as; none that
+    is far from it."""
     return get_close_matches(name, known, n=count)
 
 
 def did_you_mean(name: str, known: Collection[str] | Mapping[str, Any]) -> str:
-    """How a message about an unknown ``name`` ends: the nearest known one, or all of them, up to `MOST_LISTED`.
+    """How a message about an unknown ``name`` ends: the nearest known one, or all of them, up to
+    `MOST_LISTED`.
 
     >>> did_you_mean("clasical", ["classical", "phase"])
     "did you mean 'classical'?"

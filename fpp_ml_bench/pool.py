@@ -1,7 +1,8 @@
-"""Where many independent tasks run: in this process, in processes of this machine, or on the nodes of a Ray cluster.
+"""Where many independent tasks run: in this process, in processes of this machine, or on the nodes
+of a Ray cluster.
 
-All three are a ``map`` with results in the order of the tasks. On a cluster, the tasks of a node that dies run again
-elsewhere. Ray (extra ``cluster``) is imported only for a cluster.
+All three are a ``map`` with results in the order of the tasks. On a cluster, the tasks of a node
+that dies run again elsewhere. Ray (extra ``cluster``) is imported only for a cluster.
 """
 
 import logging
@@ -39,12 +40,13 @@ _work: tuple[str, object] = "", None
 
 @contextmanager
 def mapping(work: object, workers: int = 1, cluster: str | None = None) -> Iterator[Map]:
-    """A ``map`` over so many processes of this machine, or over all CPUs of the Ray cluster at the address ``cluster``,
-    for functions whose first argument is ``work``: ``map(function, *iterables)``. Each process gets ``work`` once and
-    keeps it, with what it holds. Functions and items must be picklable.
+    """A ``map`` over so many processes of this machine, or over all CPUs of the Ray cluster at the
+    address ``cluster``, for functions whose first argument is ``work``: ``map(function,
+    *iterables)``. Each process gets ``work`` once and keeps it, with what it holds. Functions and
+    items must be picklable.
 
-    An error of a task is raised as it is. Raises `PoolError` when a worker process dies, and for a cluster that can't
-    be reached, dies, or has other versions of the package."""
+    An error of a task is raised as it is. Raises `PoolError` when a worker process dies, and for a
+    cluster that can't be reached, dies, or has other versions of the package."""
     if cluster is not None:
         with _on_cluster(cluster, work) as mapped:
             yield mapped
@@ -62,7 +64,8 @@ def mapping(work: object, workers: int = 1, cluster: str | None = None) -> Itera
                 if not isinstance(error, BrokenProcessPool):
                     raise
                 raise PoolError(
-                    "a worker process died (out of memory?); run the same command again, it resumes; --workers 1 "
+                    "a worker process died (out of memory?); run the same command again, it "
+                    "resumes; --workers 1 "
                     "needs the least memory"
                 ) from error
             finally:
@@ -76,7 +79,8 @@ def shared_memory() -> Iterator[None]:
         yield
     except OSError as error:
         raise PoolError(
-            f"shared memory (/dev/shm) can't be used ({cause_of(error)}); have it mounted writable and with free space "
+            f"shared memory (/dev/shm) can't be used ({cause_of(error)}); have it mounted writable "
+            f"and with free space "
             "(Docker: --shm-size), or give --workers 1"
         ) from error
 
@@ -88,8 +92,9 @@ def _begin(work: object) -> None:
 
 
 def begin_worker() -> None:
-    """In a new worker process: its parent alone is interrupted from the keyboard, and when the parent ends, however it
-    does, so does this process: an orphan would stay for ever, or write into an unlocked folder."""
+    """In a new worker process: its parent alone is interrupted from the keyboard, and when the
+    parent ends, however it does, so does this process: an orphan would stay for ever, or write into
+    an unlocked folder."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -113,9 +118,13 @@ def _on_cluster(address: str, work: object) -> Iterator[Map]:
     try:
         # No environment of its own for the job: the package must be installed on the nodes.
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except Exception as error:  # Ray raises errors of many kinds here: its own, grpc's, RuntimeError
+    except (
+        Exception
+    ) as error:  # Ray raises errors of many kinds here: its own, grpc's, RuntimeError
         reason = str(error).strip().partition("\n")[0]
-        raise PoolError(f"--cluster {address}: connecting failed ({reason}); does `ray status` run there?") from error
+        raise PoolError(
+            f"--cluster {address}: connecting failed ({reason}); does `ray status` run there?"
+        ) from error
     try:
         # As bytes: arrays that Ray itself unpacks are read-only.
         content = ray.put(pickle.dumps(work))
@@ -123,7 +132,10 @@ def _on_cluster(address: str, work: object) -> Iterator[Map]:
         run, versions = uuid4().hex, _versions()
 
         def mapped(function: Callable[..., Any], *items: Iterable[Any]) -> Iterator[Any]:
-            started = deque(task.remote(run, versions, content, function, *group) for group in zip(*items, strict=True))
+            started = deque(
+                task.remote(run, versions, content, function, *group)
+                for group in zip(*items, strict=True)
+            )
             while started:
                 yield ray.get(started.popleft())
 
@@ -133,7 +145,8 @@ def _on_cluster(address: str, work: object) -> Iterator[Map]:
     except (ray.exceptions.RayError, ConnectionError) as error:
         reason = str(error).strip().partition("\n")[0]
         raise PoolError(
-            f"--cluster {address}: the cluster failed ({reason}); run the same command again, it resumes"
+            f"--cluster {address}: the cluster failed ({reason}); run the same command again, it "
+            f"resumes"
         ) from error
     finally:
         ray.shutdown()
@@ -147,12 +160,15 @@ def _check_address(address: str) -> None:
     except ValueError:
         host, port = None, None
     if not host or not port or place.scheme not in ("", "ray"):
-        raise PoolError(f"--cluster {address}: expected ray://HOST:PORT, or HOST:PORT on a node of the cluster")
+        raise PoolError(
+            f"--cluster {address}: expected ray://HOST:PORT, or HOST:PORT on a node of the cluster"
+        )
     try:
         socket.create_connection((host, port), CONNECTION_S).close()
     except OSError as error:
         raise PoolError(
-            f"--cluster {address}: nobody answers at {host}:{port} ({error.strerror or error}); start a cluster with "
+            f"--cluster {address}: nobody answers at {host}:{port} ({error.strerror or error}); "
+            f"start a cluster with "
             "`ray start --head --ray-client-server-port 10001`, and see that the address is its"
         ) from error
 
@@ -168,7 +184,11 @@ def _versions() -> dict[str, str | None]:
 
 
 def _run_task(
-    run: str, versions: dict[str, str | None], content: bytes, function: Callable[..., Any], *items: Any
+    run: str,
+    versions: dict[str, str | None],
+    content: bytes,
+    function: Callable[..., Any],
+    *items: Any,
 ) -> Any:
     """A task in a worker process of a cluster; the first of a run unpacks its work."""
     global _work
@@ -176,7 +196,12 @@ def _run_task(
         here = _versions()
         others = [name for name in versions if here[name] != versions[name]]
         if others:
-            differing = ", ".join(f"{name} {here[name]} and not {versions[name]}" for name in others)
-            raise PoolError(f"node {platform.node()} has {differing}: results may differ; install the same versions")
+            differing = ", ".join(
+                f"{name} {here[name]} and not {versions[name]}" for name in others
+            )
+            raise PoolError(
+                f"node {platform.node()} has {differing}: results may differ; install the same "
+                f"versions"
+            )
         _work = run, pickle.loads(content)
     return function(_work[1], *items)

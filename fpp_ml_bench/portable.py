@@ -1,7 +1,8 @@
-"""Elementary functions that give the same bits on every processor, for what decides a byte of a dataset.
+"""Elementary functions that give the same bits on every processor, for what decides a byte of a
+dataset.
 
-The last bits of NumPy, the C library and BLAS differ between processors; the operations here (addition,
-multiplication, division, square root) IEEE 754 rounds correctly.
+The last bits of NumPy, the C library and BLAS differ between processors; the operations here
+(addition, multiplication, division, square root) IEEE 754 rounds correctly.
 """
 
 import math
@@ -14,7 +15,8 @@ _COSINE = [(-1.0) ** k / math.factorial(2 * k) for k in range(9)]
 _SINE = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(9)]
 _EXPONENTIAL = [1.0 / math.factorial(k) for k in range(15)]
 _LOGARITHM = [2.0 / (2 * k + 1) for k in range(12)]
-"""Taylor coefficients; the first one left out is below 2^-56 of the result over the reduced range of each function."""
+"""Taylor coefficients; the first one left out is below 2^-56 of the result over the reduced range
+of each function."""
 _LN2 = 0.6931471805599453
 
 
@@ -42,7 +44,8 @@ def _cosine_and_sine(turns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def cosine_of_turns(turns: ArrayLike) -> NDArray[np.float64]:
-    """cos(2 pi ``turns``), float64 of the same shape, within 2^-52; exact at whole, half and quarter turns."""
+    """cos(2 pi ``turns``), float64 of the same shape, within 2^-52; exact at whole, half and
+    quarter turns."""
     return _cosine_and_sine(turns)[0]
 
 
@@ -52,7 +55,8 @@ def sine_of_turns(turns: ArrayLike) -> NDArray[np.float64]:
 
 
 def power(base: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
-    """``base ** exponent`` of numbers from 0 to 1, float64, relative error below 1e-15 for exponents up to 10."""
+    """``base ** exponent`` of numbers from 0 to 1, float64, relative error below 1e-15 for
+    exponents up to 10."""
     mantissa, binary = np.frexp(np.maximum(base, np.finfo(np.float64).tiny))
     low = mantissa < math.sqrt(0.5)
     mantissa = np.where(low, 2.0 * mantissa, mantissa)
@@ -62,14 +66,16 @@ def power(base: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
 
 
 def exponential(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """e to the ``x``, float64 of the same shape, relative error below 1e-15 for x from -20 to 20."""
+    """e to the ``x``, float64 of the same shape, relative error below 1e-15 for x from -20 to
+    20."""
     whole = np.rint(x / _LN2)
     return np.ldexp(_polynomial(x - whole * _LN2, _EXPONENTIAL), whole.astype(np.int32))
 
 
 def gaussian_weights(variance: float, sigmas: float = 4.0) -> NDArray[np.float64]:
-    """A Gaussian of ``variance`` > 0 samples^2 at whole samples, up to ``sigmas``, summing to 1; float64 (2 r + 1,).
-    Below 0.4, where samples of a Gaussian have another variance, the three weights that have it."""
+    """A Gaussian of ``variance`` > 0 samples^2 at whole samples, up to ``sigmas``, summing to 1;
+    float64 (2 r + 1,). Below 0.4, where samples of a Gaussian have another variance, the three
+    weights that have it."""
     if variance < 0.4:
         return np.array([variance / 2, 1.0 - variance, variance / 2])
     reach = math.ceil(sigmas * math.sqrt(variance))

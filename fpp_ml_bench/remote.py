@@ -1,4 +1,5 @@
-"""Folders at a URL of any kind that fsspec knows: ``s3://bucket/set``, ``gs://``, ``file:///net/set``."""
+"""Folders at a URL of any kind that fsspec knows: ``s3://bucket/set``, ``gs://``,
+``file:///net/set``."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,8 +19,9 @@ TEMPORARY = ".tmp"
 
 @dataclass(frozen=True)
 class RemoteFolder:
-    """A folder at ``url``; every process that holds one opens its own connection. Files are named relative to the
-    folder, with ``/``. All methods raise `RemoteError` where the service or the network refuses."""
+    """A folder at ``url``; every process that holds one opens its own connection. Files are named
+    relative to the folder, with ``/``. All methods raise `RemoteError` where the service or the
+    network refuses."""
 
     url: str
 
@@ -47,9 +49,12 @@ class RemoteFolder:
             files.mv(temporary, name)
 
     def get(self, name: str, file: Path) -> None:
-        """Copy a file from there; its folder is made. A ``name`` that leaves the folder is refused."""
+        """Copy a file from there; its folder is made. A ``name`` that leaves the folder is
+        refused."""
         if problem := path_problem(name):
-            raise RemoteError(f"{self.url}: holds a file {printable(name)!r}, {problem}; remove it there")
+            raise RemoteError(
+                f"{self.url}: holds a file {printable(name)!r}, {problem}; remove it there"
+            )
         file.parent.mkdir(parents=True, exist_ok=True)
         with self._opened("can't be read") as files:
             files.get_file(name, str(file))
@@ -80,9 +85,9 @@ def place(text: str) -> Path | RemoteFolder:
 
 @contextmanager
 def working_copy(folder: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """A local folder to work in, and a function that saves what changed there; a local ``folder`` is itself. Of a
-    remote one it is a temporary copy, saved at the end in any case, in the order in which files were written. Hidden
-    files are not saved."""
+    """A local folder to work in, and a function that saves what changed there; a local ``folder``
+    is itself. Of a remote one it is a temporary copy, saved at the end in any case, in the order in
+    which files were written. Hidden files are not saved."""
     if isinstance(folder, Path):
         yield folder, lambda: None
         return
@@ -113,4 +118,7 @@ def working_copy(folder: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[
 def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
     """Time of change, ns, and bytes of every file below a folder that is not hidden."""
     paths = [path for path in folder.rglob("[!.]*") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}
+    return {
+        path.relative_to(folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size)
+        for path in paths
+    }

@@ -46,7 +46,8 @@ class StrictModel(BaseModel):
 
 
 class SparseModel(StrictModel):
-    """Keys in ``SPARSE`` are not written where they hold their default, so that files without them stay as they are."""
+    """Keys in ``SPARSE`` are not written where they hold their default, so that files without them
+    stay as they are."""
 
     SPARSE: ClassVar[tuple[str, ...]] = ()
 
@@ -77,9 +78,14 @@ def problems_of(error: ValidationError) -> list[str]:
 
 
 def validate(
-    model: type[Model], value: Any, path: Path, kind: str, raised: type[FppBenchError] = SubmissionError
+    model: type[Model],
+    value: Any,
+    path: Path,
+    kind: str,
+    raised: type[FppBenchError] = SubmissionError,
 ) -> Model:
-    """``value`` as ``model``, or the error ``raised`` naming ``path`` and every key that is wrong."""
+    """``value`` as ``model``, or the error ``raised`` naming ``path`` and every key that is
+    wrong."""
     try:
         return model.model_validate(value)
     except ValidationError as error:

@@ -1,4 +1,5 @@
-"""The switch for skipping: leaving out work that a scene does not need (the default), or doing all of it.
+"""The switch for skipping: leaving out work that a scene does not need (the default), or doing all
+of it.
 
 The results are the same bit by bit either way. ``FPP_BENCH_SKIP=0`` in the environment switches
 skipping off, to measure its gain or to exclude it as the cause of a problem.
@@ -14,7 +15,8 @@ SWITCH = "FPP_BENCH_SKIP"
 
 
 def skipping_enabled() -> bool:
-    """Whether work that a scene does not need is left out; reads ``FPP_BENCH_SKIP`` on every call."""
+    """Whether work that a scene does not need is left out; reads ``FPP_BENCH_SKIP`` on every
+    call."""
     return os.environ.get(SWITCH, "1") != "0"
 
 
@@ -33,8 +35,9 @@ def skipping(enabled: bool) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A kind of work, ``what``: ``done`` and ``left_out`` count ``unit``; ``bytes_saved`` neither read nor written
-    (None: none involved); ``counted``: on which part of the data, and scaled up from it ("": on all)."""
+    """A kind of work, ``what``: ``done`` and ``left_out`` count ``unit``; ``bytes_saved`` neither
+    read nor written (None: none involved); ``counted``: on which part of the data, and scaled up
+    from it ("": on all)."""
 
     what: str
     unit: str
@@ -51,7 +54,8 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Explanation:
-    """The account of a run. ``skipping`` False: nothing was left out, and the lines count what would have been."""
+    """The account of a run. ``skipping`` False: nothing was left out, and the lines count what
+    would have been."""
 
     command: str
     subject: str
@@ -69,5 +73,8 @@ class Explanation:
 
 
 def explained(command: str, subject: str, lines: list[LeftOut]) -> Explanation:
-    """The account of a run, with skipping as switched in this process; lines with nothing left out are dropped."""
-    return Explanation(command, subject, tuple(line for line in lines if line.left_out), skipping_enabled())
+    """The account of a run, with skipping as switched in this process; lines with nothing left out
+    are dropped."""
+    return Explanation(
+        command, subject, tuple(line for line in lines if line.left_out), skipping_enabled()
+    )

@@ -1,10 +1,12 @@
-"""How numbers, pictures and pages look: one style for all that matplotlib draws, one frame for all that browsers show.
+"""How numbers, pictures and pages look: one style for all that matplotlib draws, one frame for all
+that browsers show.
 
-Lines have colours that colour-blind readers can tell apart (Okabe and Ito, 2008, with grey in place of yellow). Each
-quantity has its own colour map, in which equal steps of the quantity look equal.
+Lines have colours that colour-blind readers can tell apart (Okabe and Ito, 2008, with grey in place
+of yellow). Each quantity has its own colour map, in which equal steps of the quantity look equal.
 
-A page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with
-the given hashes: the page sends no request, and an injected script can't run. Text from a submission stays text.
+A page contains its style, script and pictures. Its Content-Security-Policy allows only the style
+and the script with the given hashes: the page sends no request, and an injected script can't run.
+Text from a submission stays text.
 """
 
 import hashlib
@@ -29,9 +31,18 @@ if TYPE_CHECKING:
 
 FRAME_COLOURS, DEPTH_COLOURS, ERROR_COLOURS = "gray", "viridis", "coolwarm"
 SIGMA_COLOURS, HEAT_COLOURS = "magma", "inferno"
-"""Colour maps of grey levels, of depth, of a signed error (around 0), of a standard uncertainty or an absolute error,
-and of heat maps."""
-LINE_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c", "#000000")
+"""Colour maps of grey levels, of depth, of a signed error (around 0), of a standard uncertainty or
+an absolute error, and of heat maps."""
+LINE_COLOURS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#8c8c8c",
+    "#000000",
+)
 """Colours of lines, in this order."""
 INK, SOFT, GRID = "#191c20", "#59616b", "#dfe1e5"
 """Colours of text, of what explains it, and of grids."""
@@ -57,11 +68,13 @@ Drawn = TypeVar("Drawn")
 
 @contextmanager
 def own_settings(settings: dict[Any, Any]) -> Iterator[None]:
-    """Draw within by matplotlib's defaults and ``settings``: a user's own settings change nothing, and are as before
-    afterwards. A dollar sign in a name is no formula."""
+    """Draw within by matplotlib's defaults and ``settings``: a user's own settings change nothing,
+    and are as before afterwards. A dollar sign in a name is no formula."""
     from matplotlib import rc_context, rcParamsDefault
 
-    defaults: dict[Any, Any] = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
+    defaults: dict[Any, Any] = {
+        key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")
+    }
     with rc_context(defaults | {"text.parse_math": False} | settings):
         yield
 
@@ -83,25 +96,34 @@ def figure(width_in: float, height_in: float, **settings: Any) -> "Figure":
     """An empty figure, of which nothing is cut; ``settings`` of matplotlib's ``Figure``."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width_in, height_in), **{"dpi": DPI, "layout": "constrained", **settings})
+    return Figure(
+        figsize=(width_in, height_in), **{"dpi": DPI, "layout": "constrained", **settings}
+    )
 
 
 @styled
 def figure_png(drawn: "Figure", reduced: bool = False) -> bytes:
-    """A figure as PNG, the same bytes each time; ``reduced`` to 256 colours, a third of the size."""
+    """A figure as PNG, the same bytes each time; ``reduced`` to 256 colours, a third of the
+    size."""
     from matplotlib.ticker import LogFormatterMathtext
     from PIL import Image
 
     for axes in drawn.axes:
         for axis in (axes.xaxis, axes.yaxis):
-            if isinstance(axis.get_major_formatter(), LogFormatterMathtext):  # a formula, which is no text here
+            if isinstance(
+                axis.get_major_formatter(), LogFormatterMathtext
+            ):  # a formula, which is no text here
                 axis.set_major_formatter("{x:g}")
                 axis.set_minor_formatter("")
     content, smaller = BytesIO(), BytesIO()
     drawn.savefig(content, format="png", facecolor="white", metadata={"Software": None})
     if not reduced:
         return content.getvalue()
-    image = Image.open(content).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    image = (
+        Image.open(content)
+        .convert("RGB")
+        .quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    )
     image.save(smaller, format="png", optimize=True)
     return smaller.getvalue()
 
@@ -113,7 +135,8 @@ _LETTERS_AN_INCH, _HANDLE_INCHES = 14, 0.65  # of a legend: its letters, and the
 
 @dataclass(frozen=True)
 class Picture:
-    """A map (H, W) from ``low`` to ``high`` (default: its largest value) in matplotlib's ``colours``; NaN is white."""
+    """A map (H, W) from ``low`` to ``high`` (default: its largest value) in matplotlib's
+    ``colours``; NaN is white."""
 
     image: "NDArray[Any]"
     colours: str = FRAME_COLOURS
@@ -131,8 +154,11 @@ class Picture:
         return shades[..., :3]
 
 
-def panels(titles: Sequence[str], columns: int, width_in: float, height_in: float) -> tuple[Any, list[Any]]:
-    """An empty figure with a panel for each title, in rows of ``columns``, of so many inches each; its panels."""
+def panels(
+    titles: Sequence[str], columns: int, width_in: float, height_in: float
+) -> tuple[Any, list[Any]]:
+    """An empty figure with a panel for each title, in rows of ``columns``, of so many inches each;
+    its panels."""
     rows = max(-(-len(titles) // columns), 1)
     drawn = figure(width_in * columns, height_in * rows)
     axes_of = drawn.subplots(rows, columns, squeeze=False)
@@ -146,8 +172,13 @@ def panels(titles: Sequence[str], columns: int, width_in: float, height_in: floa
 
 
 def with_legend(drawn: Any, columns: int) -> bytes:
-    """A figure with one legend of the lines of all its panels, in lines that fit its columns; PNG."""
-    handles = {label: h for axes in drawn.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    """A figure with one legend of the lines of all its panels, in lines that fit its columns;
+    PNG."""
+    handles = {
+        label: h
+        for axes in drawn.axes
+        for h, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
     letters = int(_LETTERS_AN_INCH * (drawn.get_figwidth() / columns - _HANDLE_INCHES))
     labels = [textwrap.fill(label, letters) for label in handles]
     drawn.legend(handles.values(), labels, ncols=columns, loc="outside lower center")
@@ -155,7 +186,9 @@ def with_legend(drawn: Any, columns: int) -> bytes:
 
 
 @styled
-def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], picture_inches: float = 1.1) -> bytes:
+def gallery(
+    rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], picture_inches: float = 1.1
+) -> bytes:
     """Pictures in named rows and columns, so many inches wide each; PNG."""
 
     shapes = [picture.image.shape for row in rows.values() for picture in row]
@@ -179,7 +212,8 @@ def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], pictu
 
 
 def millimetres(value: float | None) -> str:
-    """An error in mm to three decimals, in powers of ten where very small or large, a dash for an empty pixel set."""
+    """An error in mm to three decimals, in powers of ten where very small or large, a dash for an
+    empty pixel set."""
     if value is None:
         return "-"
     if value == 0:
@@ -193,7 +227,8 @@ def percent(share: float | None, decimals: int = 1) -> str:
 
 
 def three_digits(value: float | None) -> str:
-    """A time or another amount to three significant digits, whole from 100 on, a dash when unknown."""
+    """A time or another amount to three significant digits, whole from 100 on, a dash when
+    unknown."""
     return "-" if value is None else f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
@@ -220,17 +255,30 @@ def data_uri(png: bytes) -> str:
 
 
 def page(
-    package: str, template: str, title: str, style: str = "", script: str = "", description: str = "", **values: Any
+    package: str,
+    template: str,
+    title: str,
+    style: str = "",
+    script: str = "",
+    description: str = "",
+    **values: Any,
 ) -> bytes:
-    """A whole HTML page, whose body is ``templates/TEMPLATE`` of ``package`` by Jinja2 with ``values``, every one of
-    them escaped. A template may include or import those of this package's own ``templates`` too. ``title`` and
-    ``description`` are text; ``style`` and ``script`` are our own. Filters: ``printable``, ``data_uri``, and the
-    numbers of this module."""
+    """A whole HTML page, whose body is ``templates/TEMPLATE`` of ``package`` by Jinja2 with
+    ``values``, every one of them escaped. A template may include or import those of this package's
+    own ``templates`` too. ``title`` and ``description`` are text; ``style`` and ``script`` are our
+    own. Filters: ``printable``, ``data_uri``, and the numbers of this module."""
     from markupsafe import Markup
 
     environment = _environment(package)
-    style = Path(__file__).with_name("templates").joinpath("page.css").read_text(encoding="utf-8") + style
-    own = {"body": environment.get_template(template).render(title=title, **values), "style": style, "script": script}
+    style = (
+        Path(__file__).with_name("templates").joinpath("page.css").read_text(encoding="utf-8")
+        + style
+    )
+    own = {
+        "body": environment.get_template(template).render(title=title, **values),
+        "style": style,
+        "script": script,
+    }
     frame = environment.get_template("page.html")
     own = {name: Markup(text) for name, text in own.items()}
     return str(frame.render(title=title, description=description, **own)).encode("utf-8")
@@ -241,7 +289,9 @@ def _environment(package: str) -> Any:  # a jinja2.Environment
     import jinja2  # plain `fpp-eval` writes no HTML
 
     environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in (package, "fpp_ml_bench")]),
+        loader=jinja2.ChoiceLoader(
+            [jinja2.PackageLoader(name) for name in (package, "fpp_ml_bench")]
+        ),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -263,4 +313,6 @@ def _source(text: str) -> str:
     """The source of a Content-Security-Policy that allows exactly ``text``."""
     from markupsafe import Markup
 
-    return Markup(f"'sha256-{b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'")
+    return Markup(
+        f"'sha256-{b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
+    )

@@ -1,5 +1,5 @@
-"""One table for the terminal, Markdown and HTML pages. In the terminal names and numbers stay whole; where a table is
-too wide, columns are left out."""
+"""One table for the terminal, Markdown and HTML pages. In the terminal names and numbers stay
+whole; where a table is too wide, columns are left out."""
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -22,13 +22,14 @@ _PLAIN = frozenset(" -,+()/%=.")
 
 
 class Table(RichTable):
-    """A rich table of columns of text titled ``texts``, then of ``numbers``, which are aligned to the right. The first
-    ``names`` columns say what each row is. Names and numbers are never wrapped or cut; other text is wrapped between
-    words.
+    """A rich table of columns of text titled ``texts``, then of ``numbers``, which are aligned to
+    the right. The first ``names`` columns say what each row is. Names and numbers are never wrapped
+    or cut; other text is wrapped between words.
 
-    Where the terminal is too narrow, columns are left out: those titled ``first_out``, in this order, then from the
-    right, all but the last of them. A name is wrapped where even that does not fit beside it. A line below the table
-    lists what is left out and how to see it: in a wider terminal, or ``elsewhere``, such as ``--json FILE``."""
+    Where the terminal is too narrow, columns are left out: those titled ``first_out``, in this
+    order, then from the right, all but the last of them. A name is wrapped where even that does not
+    fit beside it. A line below the table lists what is left out and how to see it: in a wider
+    terminal, or ``elsewhere``, such as ``--json FILE``."""
 
     def __init__(
         self,
@@ -45,9 +46,15 @@ class Table(RichTable):
         self.names, self.first_out, self.elsewhere = names, first_out, elsewhere
 
     @classmethod
-    def of(cls, title: str, rows: Sequence[Mapping[str, str]], words: Collection[int] = (0, 1), **look: Any) -> Self:
-        """A table of ``rows`` of cells by the titles of their columns, of which those numbered ``words`` are text. No
-        cell is markup."""
+    def of(
+        cls,
+        title: str,
+        rows: Sequence[Mapping[str, str]],
+        words: Collection[int] = (0, 1),
+        **look: Any,
+    ) -> Self:
+        """A table of ``rows`` of cells by the titles of their columns, of which those numbered
+        ``words`` are text. No cell is markup."""
         table = cls(title=Text(title), **look)
         for number, name in enumerate(rows[0] if rows else ()):
             table.add_column(Text(name), justify="left" if number in words else "right")
@@ -76,7 +83,8 @@ class Table(RichTable):
         widths = {number: least for number, (least, _) in enumerate(measured)}
 
         def room() -> int:
-            """Characters left of the terminal's width: a column takes two spaces and a border beside its text."""
+            """Characters left of the terminal's width: a column takes two spaces and a border
+            beside its text."""
             return options.max_width - sum(width + 3 for width in widths.values()) - 1
 
         left_out = []
@@ -90,19 +98,31 @@ class Table(RichTable):
             least, whole = measured[number]
             widths[number] += min(whole - least, max(room(), 0))
         fitted = copy(self)
-        fitted.columns = [replace(self.columns[n], width=width, overflow="fold") for n, width in widths.items()]
+        fitted.columns = [
+            replace(self.columns[n], width=width, overflow="fold") for n, width in widths.items()
+        ]
         yield from RichTable.__rich_console__(fitted, console, options)
         if left_out:
-            titles = "; ".join(" ".join(str(self.columns[number].header).split()) for number in sorted(left_out))
+            titles = "; ".join(
+                " ".join(str(self.columns[number].header).split()) for number in sorted(left_out)
+            )
             also = f", and so does {self.elsewhere}" if self.elsewhere else ""
-            yield Text(f"Left out at {options.max_width} columns: {titles}. A wider terminal shows them{also}.")
+            yield Text(
+                f"Left out at {options.max_width} columns: {titles}. A wider terminal shows "
+                f"them{also}."
+            )
 
     def _widths(self, console: Console, options: ConsoleOptions, number: int) -> tuple[int, int]:
-        """The least width of a column's text, in characters, and the width at which nothing in it is wrapped."""
+        """The least width of a column's text, in characters, and the width at which nothing in it
+        is wrapped."""
         column, unlimited = self.columns[number], options.update(width=_UNLIMITED)
-        title, *cells = (Measurement.get(console, unlimited, text) for text in (column.header, *column.cells))
+        title, *cells = (
+            Measurement.get(console, unlimited, text) for text in (column.header, *column.cells)
+        )
         stays_whole = number < self.names or column.justify == "right"
-        least = max(1, title.minimum, *(cell.maximum if stays_whole else cell.minimum for cell in cells))
+        least = max(
+            1, title.minimum, *(cell.maximum if stays_whole else cell.minimum for cell in cells)
+        )
         return least, max(least, title.maximum, *(cell.maximum for cell in cells))
 
     def _order(self) -> list[int]:
@@ -121,7 +141,11 @@ def words(form: str) -> "TextColumn":
 
 
 def markdown_text(text: str) -> str:
-    """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a character entity.
-    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins."""
-    safe = "".join(c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};" for c in printable(text))
+    """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a
+    character entity. Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no
+    tag, link, code or mention begins."""
+    safe = "".join(
+        c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};"
+        for c in printable(text)
+    )
     return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too

@@ -1,4 +1,5 @@
-"""The columns of the leaderboard's tables: what a cell says of a row, and where a column is shown."""
+"""The columns of the leaderboard's tables: what a cell says of a row, and where a column is
+shown."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -6,7 +7,15 @@ from functools import partial
 
 from fpp_ml_bench.baselines.method import Assumption
 from fpp_ml_bench.baselines.registry import methods
-from fpp_ml_bench.evaluation.metrics import METRICS, OBJECT_KEY, RANGE_KEY, RANKED, WIDE, WIDEST, with_column
+from fpp_ml_bench.evaluation.metrics import (
+    METRICS,
+    OBJECT_KEY,
+    RANGE_KEY,
+    RANKED,
+    WIDE,
+    WIDEST,
+    with_column,
+)
 from fpp_ml_bench.evaluation.report.terminal import score_text
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.ranking import Ranked
@@ -17,26 +26,36 @@ from fpp_ml_bench.style import millimetres, percent
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
 RANK_NOTE = (
-    "Rank range: ranks that the paired tests can't exclude. A sign-flip test compares each pair of rows object by "
-    "object; two rows differ where p is at most 5% after Holm's correction over all pairs of the table. The first rank "
-    "is 1 + the number of better rows, the last is the number of ranked rows minus that of the worse rows."
+    "Rank range: ranks that the paired tests can't exclude. A sign-flip test compares each pair of "
+    "rows object by "
+    "object; two rows differ where p is at most 5% after Holm's correction over all pairs of the "
+    "table. The first rank "
+    "is 1 + the number of better rows, the last is the number of ranked rows minus that of the "
+    "worse rows."
 )
 RATIO_NOTE = (
-    "x trivial: object MAE divided by that of the best trivial method (a constant depth, or the depth of the most "
-    "similar training image) that is given no more of the ground truth than the methods of the table. "
+    "x trivial: object MAE divided by that of the best trivial method (a constant depth, or the "
+    "depth of the most "
+    "similar training image) that is given no more of the ground truth than the methods of the "
+    "table. "
     "Of depth range: object MAE divided by the depth range of each sample's object."
 )
 TRUST_NOTE = (
-    "(4): not ranked, because no maintainer vouches for the row; 1 + the number of ranked rows with a smaller error. "
-    f"{NOT_CHECKED}: time, phase reliance or robustness as the row's author reports it, not measured here."
+    "(4): not ranked, because no maintainer vouches for the row; 1 + the number of ranked rows "
+    "with a smaller error. "
+    f"{NOT_CHECKED}: time, phase reliance or robustness as the row's author reports it, not "
+    f"measured here."
 )
 TWO_SIDED_NOTE = (
-    "Every object pixel counts with its error, or with the charge where it has no answer, and every background pixel "
-    "with an answer counts with the charge. The sum is divided by the object's pixels; the charge is half the depth of "
+    "Every object pixel counts with its error, or with the charge where it has no answer, and "
+    "every background pixel "
+    "with an answer counts with the charge. The sum is divided by the object's pixels; the charge "
+    "is half the depth of "
     "the rig's working range, 300 mm for the benchmarks."
 )
 NOTE = (
-    f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. Two-sided MAE: {TWO_SIDED_NOTE} "
+    f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. Two-sided MAE: "
+    f"{TWO_SIDED_NOTE} "
     f"{RANK_NOTE} {TRUST_NOTE} {RATIO_NOTE}"
 )
 MIDDLE = 100
@@ -47,8 +66,9 @@ _DEVICE_WIDTH, _LONGEST_NAME = 40, 90
 
 @dataclass(frozen=True)
 class Column:
-    """``text`` makes the cell; ``right``: aligned to the right, as numbers are. Where a terminal is too narrow, columns
-    of the largest ``from_width`` are left out first. A table has it where ``present`` holds of any row."""
+    """``text`` makes the cell; ``right``: aligned to the right, as numbers are. Where a terminal is
+    too narrow, columns of the largest ``from_width`` are left out first. A table has it where
+    ``present`` holds of any row."""
 
     title: str
     text: Callable[[Ranked], str]
@@ -62,7 +82,8 @@ class Column:
 
 
 def columns(sort: str) -> list[Column]:
-    """Columns of a ranking by ``sort``; a key without a column gets its own, and that of the errors its interval."""
+    """Columns of a ranking by ``sort``; a key without a column gets its own, and that of the errors
+    its interval."""
     shown = {metric.key: metric.column for metric in with_column(WIDEST)}
     if sort in METRICS:
         own = sort.removesuffix("_mm").replace("_", " ")
@@ -70,7 +91,11 @@ def columns(sort: str) -> list[Column]:
     errors = []
     for key, title in shown.items():
         of_key, width = partial(error, key), 0 if key == sort else METRICS[key].column_from
-        errors.append(_sparse(title, of_key, width) if METRICS[key].charged else Column(title, of_key, True, width))
+        errors.append(
+            _sparse(title, of_key, width)
+            if METRICS[key].charged
+            else Column(title, of_key, True, width)
+        )
         if key == sort and key in RANKED:
             ends = partial(interval, between="-", key=sort)
             errors.append(Column("95% interval", ends, from_width=MIDDLE))
@@ -91,7 +116,9 @@ def columns(sort: str) -> list[Column]:
         LEARNED,
         Column("Assumes", lambda row: assumption(row.entry.row) or "-", False, WIDEST),
         Column("Timed on", lambda row: device(row.entry), False, WIDEST),
-        Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
+        Column(
+            "Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES
+        ),
     ]
 
 
@@ -100,7 +127,8 @@ def error(key: str, row: Ranked) -> str:
 
 
 def error_on(benchmark: str, row: Ranked) -> str:
-    """What the row is ranked by on its part of ``benchmark``, `TEST` or `UNSEEN`; a dash without any."""
+    """What the row is ranked by on its part of ``benchmark``, `TEST` or `UNSEEN`; a dash without
+    any."""
     part = row.on(benchmark)
     return "-" if part is None else millimetres(part.value(row.rank_key))
 
@@ -112,7 +140,9 @@ def interval(row: Ranked, between: str, key: str | None = None) -> str:
 
 def ratio(row: Ranked) -> str:
     """The row's object MAE over that of the best trivial row, to two significant digits."""
-    return "-" if row.ratio is None else f"{row.ratio:.2g}" if row.ratio < 10 else f"{row.ratio:.0f}"
+    return (
+        "-" if row.ratio is None else f"{row.ratio:.2g}" if row.ratio < 10 else f"{row.ratio:.0f}"
+    )
 
 
 def uncertainty(entry: Entry) -> RowUncertainty:
@@ -164,21 +194,29 @@ def reliance_interval(entry: Entry) -> str:
 
 
 def device(entry: Entry) -> str:
-    """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash when unknown."""
+    """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash
+    when unknown."""
     hardware = entry.row.hardware
-    return "-" if hardware is None else printable(hardware.gpu or processor(hardware), _DEVICE_WIDTH)
+    return (
+        "-" if hardware is None else printable(hardware.gpu or processor(hardware), _DEVICE_WIDTH)
+    )
 
 
 _TRUTH_NAMES = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
 
 
 def given_truth(track: str) -> str:
-    """The ground truth of the scored samples that the methods of a track are given; empty for ``metric``.
+    """The ground truth of the scored samples that the methods of a track are given; empty for
+    ``metric``.
 
     >>> given_truth("oracle range + order")
     "the test sample's depth range and fringe order"
     """
-    things = [_TRUTH_NAMES[word] for word in track.removeprefix("oracle ").split(" + ") if word in _TRUTH_NAMES]
+    things = [
+        _TRUTH_NAMES[word]
+        for word in track.removeprefix("oracle ").split(" + ")
+        if word in _TRUTH_NAMES
+    ]
     if not things:
         return ""
     return "the test sample's " + " and ".join(filter(None, (", ".join(things[:-1]), things[-1])))
@@ -190,16 +228,20 @@ def _assumption(row: Row) -> Assumption | None:
 
 
 def assumption(row: Row) -> str:
-    """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
+    """In a few words; empty where a method assumes nothing of the scene, or is not of this
+    package."""
     assumed = _assumption(row)
     return "" if assumed is None else assumed.words
 
 
 def assumption_sentences(row: Row) -> str:
-    """For the row's own page: what the method assumes, and what it was given of the samples that it is scored on."""
+    """For the row's own page: what the method assumes, and what it was given of the samples that it
+    is scored on."""
     given = given_truth(row.track)
     assumed = _assumption(row)
-    return " ".join([*([assumed.sentence] if assumed else []), *([f"Given {given}."] if given else [])])
+    return " ".join(
+        [*([assumed.sentence] if assumed else []), *([f"Given {given}."] if given else [])]
+    )
 
 
 def learned_from(row: Row) -> str:
@@ -208,13 +250,17 @@ def learned_from(row: Row) -> str:
     return "" if said is None else str(said.data)
 
 
-def _sparse(title: str, text: Callable[[Ranked], str], from_width: int = 0, right: bool = True) -> Column:
+def _sparse(
+    title: str, text: Callable[[Ranked], str], from_width: int = 0, right: bool = True
+) -> Column:
     """A column of tables in which any row has more than a dash."""
     return Column(title, text, right, from_width, lambda row: text(row) != "-")
 
 
 RANK = _sparse("Rank", lambda row: row.ranks)
-CODE = Column("Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), False, MIDDLE)
+CODE = Column(
+    "Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), False, MIDDLE
+)
 METHOD = Column("Method", lambda row: printable(row.short_name), False)
 FRAMES = Column("Frames", lambda row: str(row.entry.frames))
 PARTS = tuple(
@@ -232,5 +278,7 @@ UNCERTAINTY = (
     _sparse("AUSE", lambda row: millimetres(uncertainty(row.entry).ause_mae_mm), WIDEST),
     _sparse("Surest 95%", lambda row: surest(row.entry), WIDEST),
 )
-LEARNED = _sparse("Learned from", lambda row: learned_from(row.entry.row) or "-", WIDEST, right=False)
+LEARNED = _sparse(
+    "Learned from", lambda row: learned_from(row.entry.row) or "-", WIDEST, right=False
+)
 PROVENANCE = Column("Provenance", lambda row: row.provenance, False, MIDDLE)

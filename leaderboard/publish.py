@@ -1,8 +1,10 @@
-"""What the leaderboard puts on the Hub: the tasks in a dataset's repository, the page as a static Space, results.
+"""What the leaderboard puts on the Hub: the tasks in a dataset's repository, the page as a static
+Space, results.
 
-The Hub ranks by the greatest value and knows no unit. So an error becomes a score that falls strictly with it,
-100 / (1 + object MAE / 10 mm): 0 mm: 100; 1 mm: 90.9; 10 mm: 50; 100 mm: 9.1. The millimetres are in the notes.
-Own definition; 10 mm is the widest tolerance that this benchmark counts pixels within.
+The Hub ranks by the greatest value and knows no unit. So an error becomes a score that falls
+strictly with it, 100 / (1 + object MAE / 10 mm): 0 mm: 100; 1 mm: 90.9; 10 mm: 50; 100 mm: 9.1. The
+millimetres are in the notes. Own definition; 10 mm is the widest tolerance that this benchmark
+counts pixels within.
 """
 
 from collections.abc import Sequence
@@ -84,35 +86,50 @@ def hub_score(object_mae_mm: float) -> float:
 
 
 def task_of(row: Row, name: str) -> str:
-    """The task that a result belongs to; `PublishError`, naming the file ``name``, where it belongs to none."""
+    """The task that a result belongs to; `PublishError`, naming the file ``name``, where it belongs
+    to none."""
     if (row.dataset.split, row.target, row.mode) != (SPLIT, TARGET, MODE):
         raise PublishError(
-            f"{name}: the Hub's benchmark is scored on the {SPLIT} split against {TARGET} in {MODE} mode, this result "
-            f"on {row.dataset.split} against {row.target} in {row.mode} mode; score the predictions so first"
+            f"{name}: the Hub's benchmark is scored on the {SPLIT} split against {TARGET} in "
+            f"{MODE} mode, this result "
+            f"on {row.dataset.split} against {row.target} in {row.mode} mode; score the "
+            f"predictions so first"
         )
     if row.track not in TRACKS:
         raise PublishError(
-            f"{name}: the Hub's benchmark has no task for the {row.track} track (the method was given "
-            f"{given_truth(row.track)}); publish a result of a method that finds the object and the fringe order itself"
+            f"{name}: the Hub's benchmark has no task for the {row.track} track (the method was "
+            f"given "
+            f"{given_truth(row.track)}); publish a result of a method that finds the object and "
+            f"the fringe order itself"
         )
     return task_id(set(row.submission.frames_used) <= {SINGLE_SHOT_FRAME}, row.track)
 
 
 def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, str]:
-    """What a dataset's repository ``repo`` says beside its data: the card, and the registration of the tasks."""
+    """What a dataset's repository ``repo`` says beside its data: the card, and the registration of
+    the tasks."""
     widest = max(dataset.configs, key=CONFIGS.index)
     tasks = [
         {"id": task_id(single, track), "config": CONFIGS[0] if single else widest, "split": SPLIT}
         for single in ([True] if widest == CONFIGS[0] else [True, False])
         for track in TRACKS
     ]
-    description = f"Depth from fringe images in structured light. {SCORE_TEXT[0].upper()}{SCORE_TEXT[1:]}."
-    evaluation = {"name": NAME, "description": description, "evaluation_framework": FRAMEWORK, "tasks": tasks}
+    description = (
+        f"Depth from fringe images in structured light. {SCORE_TEXT[0].upper()}{SCORE_TEXT[1:]}."
+    )
+    evaluation = {
+        "name": NAME,
+        "description": description,
+        "evaluation_framework": FRAMEWORK,
+        "tasks": tasks,
+    }
     splits = []
     for split in dataset.splits:
         samples = dataset.manifest.samples[split]
         objects = dict.fromkeys(sample["object"] for sample in samples)
-        splits.append(f"| {split} | {len(samples)} | {', '.join(markdown_text(name) for name in objects)} |")
+        splits.append(
+            f"| {split} | {len(samples)} | {', '.join(markdown_text(name) for name in objects)} |"
+        )
     body = _BODY.format(
         rows=sum(len(samples) for samples in dataset.splits.values()),
         height=dataset.size[0],
@@ -132,10 +149,13 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
     return {CARD_FILE: card_head(dataset, licence) + body, EVAL_FILE: yaml_text(evaluation)}
 
 
-def stage_page(results: Sequence[Path], repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
-    """Write the page of result and row files, or of the rows shipped with the package where none are named, and the
-    Space's README into ``folder``; ``dataset_repo`` is linked from it. Nothing is looked for in the current folder.
-    Raises SubmissionError for a file that is no sound result."""
+def stage_page(
+    results: Sequence[Path], repo: str, folder: Path, dataset_repo: str | None = None
+) -> Publication:
+    """Write the page of result and row files, or of the rows shipped with the package where none
+    are named, and the Space's README into ``folder``; ``dataset_repo`` is linked from it. Nothing
+    is looked for in the current folder. Raises SubmissionError for a file that is no sound
+    result."""
     rows = expand(results) if results else shipped_rows()
     write_page(rank(read_entries(rows)), chosen_tables(None), folder)
     head: dict[str, Any] = {
@@ -151,8 +171,12 @@ def stage_page(results: Sequence[Path], repo: str, folder: Path, dataset_repo: s
         "tags": ["leaderboard", "depth-estimation", "structured-light", "fpp-ml-bench"],
         **({"datasets": [dataset_repo]} if dataset_repo is not None else {}),
     }
-    body = f"The page is `{INDEX}`, written by `fpp-bench leaderboard`, sent by `fpp-bench publish`.\n"
-    (folder / CARD_FILE).write_bytes(f"---\n{yaml_text(head, allow_unicode=True)}---\n{body}".encode())
+    body = (
+        f"The page is `{INDEX}`, written by `fpp-bench leaderboard`, sent by `fpp-bench publish`.\n"
+    )
+    (folder / CARD_FILE).write_bytes(
+        f"---\n{yaml_text(head, allow_unicode=True)}---\n{body}".encode()
+    )
     (folder / MARK).write_bytes(mark_bytes("leaderboard"))
     return Publication("space", repo, folder, "FPP-ML-Bench leaderboard", (f"{SUBMISSIONS}/",))
 
@@ -166,12 +190,17 @@ def stage_results(
     content: object,
     source_url: str | None = None,
 ) -> Publication:
-    """Write a file for each result into ``folder``; it replaces an earlier result of the same task. Only numbers and
-    fixed words of a result are published, no text that its author wrote. A result scored on other data than ``content``
-    (`DatasetFolder.content`, by the repository's mark) is refused, as is a result of another split or target, or
-    without an object score (`PublishError`). ``revision`` None: the data can't be compared (a dry run)."""
-    if source_url is not None and (urlsplit(source_url).scheme != "https" or not urlsplit(source_url).netloc):
-        raise PublishError(f"--source-url: expected an https address, got {printable(source_url, 120)!r}")
+    """Write a file for each result into ``folder``; it replaces an earlier result of the same task.
+    Only numbers and fixed words of a result are published, no text that its author wrote. A result
+    scored on other data than ``content`` (`DatasetFolder.content`, by the repository's mark) is
+    refused, as is a result of another split or target, or without an object score (`PublishError`).
+    ``revision`` None: the data can't be compared (a dry run)."""
+    if source_url is not None and (
+        urlsplit(source_url).scheme != "https" or not urlsplit(source_url).netloc
+    ):
+        raise PublishError(
+            f"--source-url: expected an https address, got {printable(source_url, 120)!r}"
+        )
     named: dict[str, Path] = {}
     (folder / RESULT_FOLDER).mkdir()
     for path in paths:
@@ -182,20 +211,23 @@ def stage_results(
         if other and revision is not None:
             raise PublishError(
                 f"{file}: was scored on other data than {scored_on} holds ({other[0]} is "
-                f"{row.dataset.content[other[0]]}, there {printable(held.get(other[0]), 40)}); score the predictions "
+                f"{row.dataset.content[other[0]]}, there {printable(held.get(other[0]), 40)}); "
+                f"score the predictions "
                 "on that dataset, or publish this one"
             )
         task = task_of(row, file)
         if task in named:
             raise PublishError(
-                f"{printable(str(named[task]), 300)} and {file} are both results of {task}; a model has one of "
+                f"{printable(str(named[task]), 300)} and {file} are both results of {task}; a "
+                f"model has one of "
                 "each, publish the other with its own model repository"
             )
         named[task] = path
         error_mm = row.metrics.object_mae_mm
         if error_mm is None:
             raise PublishError(
-                f"{file}: has no object score (no sample shows an object), so there is nothing to rank by"
+                f"{file}: has no object score (no sample shows an object), so there is nothing to "
+                f"rank by"
             )
         published = EvalResultEntry(
             dataset_id=scored_on,
@@ -208,21 +240,30 @@ def stage_results(
             notes=_notes(entry),
         )
         name = f"{task}--{scored_on.replace('/', '--')}.yaml"
-        (folder / RESULT_FOLDER / name).write_bytes(yaml_text(eval_result_entries_to_yaml([published])).encode())
+        (folder / RESULT_FOLDER / name).write_bytes(
+            yaml_text(eval_result_entries_to_yaml([published])).encode()
+        )
     return Publication("model", repo, folder, f"{NAME} results: {', '.join(named)}")
 
 
 def _notes(entry: Entry) -> str:
     row, metrics, seconds = entry.row, entry.row.metrics, entry.value("seconds_per_sample")
     ends = row.intervals.of("object_mae_mm")
-    interval = f" (95% interval {millimetres(ends[0])} to {millimetres(ends[1])})" if ends is not None else ""
+    interval = (
+        f" (95% interval {millimetres(ends[0])} to {millimetres(ends[1])})"
+        if ends is not None
+        else ""
+    )
     source = "measured" if entry.time_measured else "self-reported"
     time = "" if seconds is None else f"; {seconds:.4g} s per sample, {source}"
     missing = percent(metrics.object_missing_share)
     return (
         f"{SCORE_TEXT}. Object MAE {millimetres(metrics.object_mae_mm)} mm{interval}, RMSE "
-        f"{millimetres(metrics.object_rmse_mm)} mm; overall MAE {millimetres(metrics.overall_mae_mm)} mm; object "
-        f"pixels missing {missing}; {row.dataset.samples} samples of {row.dataset.split}, {row.track} track, "
-        f"{entry.frames} {'frame' if entry.frames == 1 else 'frames'}{time}; protocol {row.protocol_version}, content "
+        f"{millimetres(metrics.object_rmse_mm)} mm; overall MAE "
+        f"{millimetres(metrics.overall_mae_mm)} mm; object "
+        f"pixels missing {missing}; {row.dataset.samples} samples of {row.dataset.split}, "
+        f"{row.track} track, "
+        f"{entry.frames} {'frame' if entry.frames == 1 else 'frames'}{time}; protocol "
+        f"{row.protocol_version}, content "
         f"{row.dataset.truth[:12]}"
     )

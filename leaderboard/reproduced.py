@@ -1,11 +1,12 @@
-"""A table of `fpp-bench reproduce`: rows that were measured here, kept as rows of the leaderboard, beside the numbers
-that the paper reports and the best trivial method; which of the paper's orderings hold; and the page of it all, in
-Markdown and for a terminal.
+"""A table of `fpp-bench reproduce`: rows that were measured here, kept as rows of the leaderboard,
+beside the numbers that the paper reports and the best trivial method; which of the paper's
+orderings hold; and the page of it all, in Markdown and for a terminal.
 
-An ordering *holds* or is *reversed* where the objects decide it: the sign-flip test of the paired differences, with
-Holm's correction over the pairs of the table, tells the rows apart, and the 95% interval over objects, and over the
-seeds with which both rows were trained (`interval_over_seeds`), leaves 0 out. Else it is only *seen*, or *seen
-reversed*: the mean over these objects goes that way. The test split's five, fewer than `FEWEST_OBJECTS`, decide none.
+An ordering *holds* or is *reversed* where the objects decide it: the sign-flip test of the paired
+differences, with Holm's correction over the pairs of the table, tells the rows apart, and the 95%
+interval over objects, and over the seeds with which both rows were trained (`interval_over_seeds`),
+leaves 0 out. Else it is only *seen*, or *seen reversed*: the mean over these objects goes that way.
+The test split's five, fewer than `FEWEST_OBJECTS`, decide none.
 """
 
 import statistics
@@ -52,7 +53,13 @@ from fpp_ml_bench.evaluation.score.uncertainty import (
 from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.ranking import given_words
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, write_row
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, SHIPPED_ROWS, Entry, read_entry
+from fpp_ml_bench.leaderboard.rows import (
+    BY_THE_PAPER,
+    MEASURED_HERE,
+    SHIPPED_ROWS,
+    Entry,
+    read_entry,
+)
 from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, ReportedRow, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import panels, percent, styled, three_digits, with_legend
@@ -79,11 +86,17 @@ def write_measured(result: Result, path: Path) -> None:
     write_row(row_of(result, path), path)
 
 
-def row_that_holds(path: Path, opened: DatasetFolder, value: str, setting: str = "weights_sha256") -> Entry | None:
-    """The row in ``path`` if it is sound, of this dataset, and of a submission with this ``value`` of a ``setting``;
-    else None."""
+def row_that_holds(
+    path: Path, opened: DatasetFolder, value: str, setting: str = "weights_sha256"
+) -> Entry | None:
+    """The row in ``path`` if it is sound, of this dataset, and of a submission with this ``value``
+    of a ``setting``; else None."""
     entry = _sound_row(path)
-    holds = entry is not None and _is_of(entry, opened) and entry.row.submission.settings.get(setting) == value
+    holds = (
+        entry is not None
+        and _is_of(entry, opened)
+        and entry.row.submission.settings.get(setting) == value
+    )
     return entry if holds else None
 
 
@@ -92,7 +105,8 @@ def check_row_is_of(path: Path, opened: DatasetFolder) -> None:
     entry = _sound_row(path)  # an unreadable one is replaced, nothing is lost
     if entry is not None and not _is_of(entry, opened):
         raise SubmissionError(
-            f"{path}: is a row on other data ({entry.row.dataset.identity}) than {opened.path} holds; give another "
+            f"{path}: is a row on other data ({entry.row.dataset.identity}) than {opened.path} "
+            f"holds; give another "
             "--rows, or move the row away if it is out of date"
         )
 
@@ -110,10 +124,10 @@ def _sound_row(path: Path) -> Entry | None:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a table. ``found``: the row of each seed, the recipe's own first, or its scores where they are of every
-    frame or of a cross-validation; empty where nothing has been measured. ``entry``: the row of the recipe's own seed;
-    ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None where it reports none; ``recipe``: None of a
-    trivial method."""
+    """A line of a table. ``found``: the row of each seed, the recipe's own first, or its scores
+    where they are of every frame or of a cross-validation; empty where nothing has been measured.
+    ``entry``: the row of the recipe's own seed; ``paper_mm``: the paper's errors by the keys of
+    `HEADLINE`, None where it reports none; ``recipe``: None of a trivial method."""
 
     row: str
     label: str
@@ -127,7 +141,9 @@ class Line:
         """Of its row, or of the rows that its recipe would have; a dash without either."""
         if self.entry is not None or self.recipe is None:
             return "-" if self.entry is None else self.entry.row.track
-        given = ["range"] * (self.recipe.normalisation == "individual") + ["mask"] * self.recipe.background_removed
+        given = ["range"] * (self.recipe.normalisation == "individual") + [
+            "mask"
+        ] * self.recipe.background_removed
         return f"oracle {' + '.join(given)}" if given else "metric"
 
     def error(self, key: str) -> float | None:
@@ -149,25 +165,34 @@ def _errors(found: Row | Scores) -> Errors:
 def _by_object(found: Row | Scores) -> dict[str, float]:
     if isinstance(found, Scores):
         return dict(found.per_object)
-    return {part.object: value for part in found.per_object if (value := getattr(part, MAIN_KEY)) is not None}
+    return {
+        part.object: value
+        for part in found.per_object
+        if (value := getattr(part, MAIN_KEY)) is not None
+    }
 
 
 def _reported(table: str) -> dict[str, ReportedRow]:
     return {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
 
 
-def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
-    """Lines of ``table`` in the paper's order, below those of trivial methods. Rows of other weights or another dataset
-    are left empty. Where a training was not begun below ``folders``, its rows may be of another machine: those of the
-    same recipe are shown. Where the paper scores every frame (multi-frame), a training's first line does too, and a
-    second line is its row in the leaderboard: the first frame only, without a number of the paper."""
+def table_lines(
+    table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder
+) -> list[Line]:
+    """Lines of ``table`` in the paper's order, below those of trivial methods. Rows of other
+    weights or another dataset are left empty. Where a training was not begun below ``folders``, its
+    rows may be of another machine: those of the same recipe are shown. Where the paper scores every
+    frame (multi-frame), a training's first line does too, and a second line is its row in the
+    leaderboard: the first frame only, without a number of the paper."""
     if table == FOLDS:
         return _fold_lines(jobs, folders, opened)
     reported, lines = _reported(table), []
     for row in table_rows(table):
         recipes = [job.recipe for job in jobs if f"{table}/{row}" in job.rows]
         recipe, paper = recipes[0], reported.get(row)
-        label, paper_mm = (paper.label, paper.errors_mm) if paper else (_NOT_IN_THE_PAPER.get(row, row), None)
+        label, paper_mm = (
+            (paper.label, paper.errors_mm) if paper else (_NOT_IN_THE_PAPER.get(row, row), None)
+        )
         weights = {one.seed: _weights_sha256(one, folders, opened) for one in recipes}
         entries = {
             one.seed: held
@@ -180,15 +205,22 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
         if table != "multi_frame" or recipe.frames == "single_shot" or weights[recipe.seed] is None:
             lines.append(Line(row, label, recipe, found, entry, paper_mm))
             continue
-        every = scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe, weights[recipe.seed])
-        lines.append(Line(row, label, recipe, {recipe.seed: every} if every else {}, entry, paper_mm))
+        every = scores_that_hold(
+            folders.scores(recipe), opened.fingerprint, recipe, weights[recipe.seed]
+        )
+        lines.append(
+            Line(row, label, recipe, {recipe.seed: every} if every else {}, entry, paper_mm)
+        )
         lines.append(Line(row, f"{label}, its first frame only", recipe, found, entry))
-    return [*_trivial_lines({line.entry.row.track for line in lines if line.entry is not None}, opened), *lines]
+    return [
+        *_trivial_lines({line.entry.row.track for line in lines if line.entry is not None}, opened),
+        *lines,
+    ]
 
 
 def _trivial_lines(tracks: set[Track], opened: DatasetFolder) -> list[Line]:
-    """A line for the best trivial method of each of ``tracks``: of those that come with the package, were scored on
-    these data, and are given no more of the ground truth."""
+    """A line for the best trivial method of each of ``tracks``: of those that come with the
+    package, were scored on these data, and are given no more of the ground truth."""
     entries = [
         entry
         for entry in map(read_entry, sorted(SHIPPED_ROWS.glob("*.json")) if tracks else ())
@@ -201,27 +233,41 @@ def _trivial_lines(tracks: set[Track], opened: DatasetFolder) -> list[Line]:
         known = [entry for entry in entries if given_words(entry.row.track) <= given_words(track)]
         if known:
             entry = min(known, key=lambda entry: entry.value(MAIN_KEY) or 0.0)
-            best[entry.path.stem] = Line(entry.path.stem, f"{entry.name} (trivial)", None, {0: entry.row}, entry)
+            best[entry.path.stem] = Line(
+                entry.path.stem, f"{entry.name} (trivial)", None, {0: entry.row}, entry
+            )
     return list(best.values())
 
 
 def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
-    """The rows of a cross-validation, over the objects of the parts that all of them were trained for, below the best
-    constant share of the given range, chosen on the training objects of each part."""
+    """The rows of a cross-validation, over the objects of the parts that all of them were trained
+    for, below the best constant share of the given range, chosen on the training objects of each
+    part."""
     recipes_of = [job.recipe for job in jobs]
-    held = {one.name: scores_that_hold(folders.scores(one), opened.fingerprint, one) for one in recipes_of}
+    held = {
+        one.name: scores_that_hold(folders.scores(one), opened.fingerprint, one)
+        for one in recipes_of
+    }
     names = dict.fromkeys(row for job in jobs for row in job.rows)
-    parts = {one.fold for one in recipes_of} - {one.fold for one in recipes_of if held[one.name] is None}
+    parts = {one.fold for one in recipes_of} - {
+        one.fold for one in recipes_of if held[one.name] is None
+    }
     lines = []
     for name in names:
         table, _, row = name.partition("/")
         paper = _reported(table).get(row)
         recipes = [job.recipe for job in jobs if name in job.rows]
-        scores = [one for recipe in recipes if recipe.fold in parts and (one := held[recipe.name]) is not None]
+        scores = [
+            one
+            for recipe in recipes
+            if recipe.fold in parts and (one := held[recipe.name]) is not None
+        ]
         found = {recipes[0].seed: joined(scores)} if scores else {}
         label, paper_mm = (f"{paper.label} ({table})", paper.errors_mm) if paper else (name, None)
         lines.append(Line(name, label, recipes[0], found, None, paper_mm))
-    constants = [constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)]
+    constants = [
+        constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)
+    ]
     if constants and any(one.normalisation == "individual" for one in recipes_of):
         label = "best constant in the given range (trivial)"
         lines.insert(0, Line("constant", label, None, {0: joined(constants)}, None))
@@ -229,8 +275,8 @@ def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) ->
 
 
 def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> str | None:
-    """The weights whose rows are shown: those trained below ``folders``; where no training was begun there, those of
-    the row, if that is of this recipe; else None."""
+    """The weights whose rows are shown: those trained below ``folders``; where no training was
+    begun there, those of the row, if that is of this recipe; else None."""
     weights = current_weights(recipe, folders)
     if weights is not None:
         return file_sha256(weights)
@@ -243,8 +289,8 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
 
 @dataclass(frozen=True)
 class Gap:
-    """Mean difference in object MAE, mm, its 95% interval, how many objects and seeds it is over, and the p value of
-    the sign-flip test over objects."""
+    """Mean difference in object MAE, mm, its 95% interval, how many objects and seeds it is over,
+    and the p value of the sign-flip test over objects."""
 
     mean_mm: float
     interval: Interval | None
@@ -260,9 +306,9 @@ class Gap:
 
 @dataclass(frozen=True)
 class Ordering:
-    """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; ``here``: worse
-    minus better; ``p_holm``: its p value after Holm's correction. ``same_track`` is False where the rows were given
-    different ground truth of the samples."""
+    """The paper reports a smaller object MAE for ``better`` than for ``worse``, by
+    ``paper_gap_mm``; ``here``: worse minus better; ``p_holm``: its p value after Holm's correction.
+    ``same_track`` is False where the rows were given different ground truth of the samples."""
 
     better: str
     worse: str
@@ -281,23 +327,34 @@ class Ordering:
 
 def orderings(lines: Sequence[Line]) -> list[Ordering]:
     """Every pair of measured lines whose numbers in the paper differ, the paper's best first."""
-    compared = [(line.paper_mm[MAIN_KEY], line) for line in lines if line.found and line.paper_mm is not None]
+    compared = [
+        (line.paper_mm[MAIN_KEY], line)
+        for line in lines
+        if line.found and line.paper_mm is not None
+    ]
     found = [
         (better, worse, worse_mm - better_mm, here)
-        for (better_mm, better), (worse_mm, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2)
+        for (better_mm, better), (worse_mm, worse) in combinations(
+            sorted(compared, key=lambda c: c[0]), 2
+        )
         if worse_mm > better_mm and (here := gap(worse, better)) is not None
     ]
     return [
         Ordering(better.label, worse.label, paper_gap_mm, here, p_holm, better.track == worse.track)
-        for (better, worse, paper_gap_mm, here), p_holm in zip(found, holm([here.p for *_, here in found]), strict=True)
+        for (better, worse, paper_gap_mm, here), p_holm in zip(
+            found, holm([here.p for *_, here in found]), strict=True
+        )
     ]
 
 
 def gap(line: Line, other: Line) -> Gap | None:
-    """Object MAE of ``line`` minus that of ``other``, over the objects and seeds of both; None without any."""
+    """Object MAE of ``line`` minus that of ``other``, over the objects and seeds of both; None
+    without any."""
     first, second = line.by_seed, other.by_seed
     seeds = [seed for seed in first if seed in second]
-    names = [name for name in (first[seeds[0]] if seeds else ()) if all(name in second[s] for s in seeds)]
+    names = [
+        name for name in (first[seeds[0]] if seeds else ()) if all(name in second[s] for s in seeds)
+    ]
     if not names:
         return None
     gaps = [{name: first[seed][name] - second[seed][name] for name in names} for seed in seeds]
@@ -307,35 +364,52 @@ def gap(line: Line, other: Line) -> Gap | None:
 
 
 def conclusion(table: str, lines: Sequence[Line]) -> str:
-    """What the lines say, in a sentence: how many of the paper's orderings hold, or, in a table that the paper does not
-    have, how far each line is from the first; "" where that is not known."""
+    """What the lines say, in a sentence: how many of the paper's orderings hold, or, in a table
+    that the paper does not have, how far each line is from the first; "" where that is not
+    known."""
     lines = [line for line in lines if line.recipe is not None]
     if table in paper_tables() or table == FOLDS:
         return orderings_sentence(orderings(lines))
     said = []
     for line in lines[1:]:
         if here := gap(line, lines[0]):
-            ends = f" (95% interval over {here.objects} objects {here.between})" if here.interval else ""
+            ends = (
+                f" (95% interval over {here.objects} objects {here.between})"
+                if here.interval
+                else ""
+            )
             said.append(f"{line.label} {here.mean_mm:+.2f} mm{ends}")
-    return f"Object MAE against {lines[0].label}, sample by sample: {'; '.join(said)}." if said else ""
+    return (
+        f"Object MAE against {lines[0].label}, sample by sample: {'; '.join(said)}." if said else ""
+    )
 
 
 def orderings_sentence(judged: Sequence[Ordering]) -> str:
-    """How many of the paper's orderings the objects decide, and which way the others go in the mean."""
+    """How many of the paper's orderings the objects decide, and which way the others go in the
+    mean."""
     if not judged:
-        return "No two rows of the paper's have been measured here yet, so none of its orderings can be judged."
+        return (
+            "No two rows of the paper's have been measured here yet, so none of its orderings can "
+            "be judged."
+        )
     count = Counter(ordering.verdict for ordering in judged)
     objects = max(ordering.here.objects for ordering in judged)
-    few = f" Fewer than {FEWEST_OBJECTS} objects can decide none." if objects < FEWEST_OBJECTS else ""
+    few = (
+        f" Fewer than {FEWEST_OBJECTS} objects can decide none." if objects < FEWEST_OBJECTS else ""
+    )
     return (
-        f"The paper's pairwise orderings by object MAE, {len(judged)} among the rows measured here. Decided by "
-        f"{objects} objects, with Holm's correction: {count['holds']} hold, {count['reversed']} reversed. Only seen in "
-        f"the mean over them: {count['seen']} as in the paper, {count['seen reversed']} reversed.{few}"
+        f"The paper's pairwise orderings by object MAE, {len(judged)} among the rows measured "
+        f"here. Decided by "
+        f"{objects} objects, with Holm's correction: {count['holds']} hold, {count['reversed']} "
+        f"reversed. Only seen in "
+        f"the mean over them: {count['seen']} as in the paper, {count['seen reversed']} "
+        f"reversed.{few}"
     )
 
 
 def _cells(line: Line, preset: str) -> dict[str, str]:
-    """Each cell by the title of its column: a dash where nothing is known, errors with the paper's two decimals."""
+    """Each cell by the title of its column: a dash where nothing is known, errors with the paper's
+    two decimals."""
     entry, by_seed = line.entry, line.by_seed
     here = _pair if line.found else lambda error, pixels: "-"
     ends = interval_over_seeds(list(by_seed.values()))
@@ -380,23 +454,35 @@ def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
     title = _TITLES.get(table) or paper_tables()[table].title
     rows = [_cells(line, preset) for line in lines]
     optional = (_EACH_SEED,) if table in paper_tables() else tuple(rows[0])
-    shown = [name for name in rows[0] if name not in optional or {row[name] for row in rows} != {"-"}]
-    return Table.of(title, [{name: row[name] for name in shown} for row in rows], elsewhere="the page below")
+    shown = [
+        name for name in rows[0] if name not in optional or {row[name] for row in rows} != {"-"}
+    ]
+    return Table.of(
+        title, [{name: row[name] for name in shown} for row in rows], elsewhere="the page below"
+    )
 
 
 def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
-    """Write the page of a table from the rows that there are; its path. Histograms of the multi-frame table are beside
-    it. SubmissionError where it can't be written."""
+    """Write the page of a table from the rows that there are; its path. Histograms of the
+    multi-frame table are beside it. SubmissionError where it can't be written."""
     folders, path = settings.folders, settings.folders.table(table)
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)
-    command = settings.command.replace(f"{table}/{settings.row}", table, 1) if settings.row else settings.command
+    command = (
+        settings.command.replace(f"{table}/{settings.row}", table, 1)
+        if settings.row
+        else settings.command
+    )
     text = table_markdown(table, lines, folders.preset, command, outcome.failed)
     counted = {
         f"{job.recipe.frames}: {scores.pairs} pairs": scores
         for job in outcome.jobs
         if table == "multi_frame" and job.has_scores and job.recipe.seed == SEED
         if (weights := _weights_sha256(job.recipe, folders, outcome.opened))
-        if (scores := scores_that_hold(folders.scores(job.recipe), outcome.opened.fingerprint, job.recipe, weights))
+        if (
+            scores := scores_that_hold(
+                folders.scores(job.recipe), outcome.opened.fingerprint, job.recipe, weights
+            )
+        )
         if scores.counts
     }
     if counted:
@@ -408,18 +494,25 @@ def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Pa
 
 @styled
 def draw_histograms(counted: Mapping[str, Scores]) -> bytes:
-    """A panel for each row: the share of its pairs by overall MAE, as in the paper's figures, and object MAE; PNG."""
+    """A panel for each row: the share of its pairs by overall MAE, as in the paper's figures, and
+    object MAE; PNG."""
     drawn, panels_of = panels(list(counted), 3, 3.0, 2.2)
     for axes, scores in zip(panels_of, counted.values(), strict=True):
-        for key, label, fill in ((OVERALL_KEY, "overall MAE", True), (MAIN_KEY, "object MAE", False)):
+        for key, label, fill in (
+            (OVERALL_KEY, "overall MAE", True),
+            (MAIN_KEY, "object MAE", False),
+        ):
             shares = [100 * count / scores.pairs for count in scores.counts[key]]
             axes.stairs(shares, BINS_MM, fill=fill, label=label, linewidth=1.2)
         axes.set(xscale="log", xlabel="mm", ylabel="% of pairs")
     return with_legend(drawn, 2)
 
 
-def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]) -> str:
-    """The page of a table as Markdown. ``command`` makes it again; ``failed`` maps a recipe's name to its error."""
+def table_markdown(
+    table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]
+) -> str:
+    """The page of a table as Markdown. ``command`` makes it again; ``failed`` maps a recipe's name
+    to its error."""
     shown = line_table(table, lines, preset)
     parts = [
         f"# {markdown_text(str(shown.title))}",
@@ -430,26 +523,36 @@ def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str,
         *shown.markdown(),
         "",
         *_missing(lines, command, failed),
-        *(_orderings(orderings(lines)) if table in paper_tables() or table == FOLDS else [conclusion(table, lines)]),
+        *(
+            _orderings(orderings(lines))
+            if table in paper_tables() or table == FOLDS
+            else [conclusion(table, lines)]
+        ),
     ]
     return "\n".join(parts).rstrip("\n") + "\n"
 
 
 def _about(lines: Sequence[Line], in_the_paper: bool) -> list[str]:
-    entry = next((line.entry for line in lines if line.entry is not None and line.recipe is not None), None)
+    entry = next(
+        (line.entry for line in lines if line.entry is not None and line.recipe is not None), None
+    )
     if entry is None:
         return []
     data = entry.row.dataset
     height, width = data.size
     objects = len(entry.row.per_object)
     here = (
-        f"{MEASURED_HERE.capitalize()}: {data.split} split of {markdown_text(data.name)} ({data.truth[:8]}), "
-        f"{data.samples} samples of {objects} objects, {width} x {height} px, against decoded depth; times on "
+        f"{MEASURED_HERE.capitalize()}: {data.split} split of {markdown_text(data.name)} "
+        f"({data.truth[:8]}), "
+        f"{data.samples} samples of {objects} objects, {width} x {height} px, against decoded "
+        f"depth; times on "
         f"{markdown_text(_devices(lines))}."
     )
     paper = (
-        f" {BY_THE_PAPER.capitalize()}: its own data at 960 x 960 px, its authors' code; the two are shown beside each "
-        "other, not ranked together. Rows of the oracle range track were given the test samples' depth range, here as "
+        f" {BY_THE_PAPER.capitalize()}: its own data at 960 x 960 px, its authors' code; the two "
+        f"are shown beside each "
+        "other, not ranked together. Rows of the oracle range track were given the test samples' "
+        "depth range, here as "
         f"in the paper, and score the background in units of that range. {PAPER_DEPTHS}"
     )
     return ["", here + paper if in_the_paper else here]
@@ -461,14 +564,20 @@ def _devices(lines: Sequence[Line]) -> str:
     for line in lines:
         if line.entry is not None:
             labels.setdefault(device(line.entry), []).append(line.label)
-    return "; ".join(name if len(labels) == 1 else f"{name} ({', '.join(rows)})" for name, rows in labels.items())
+    return "; ".join(
+        name if len(labels) == 1 else f"{name} ({', '.join(rows)})" for name, rows in labels.items()
+    )
 
 
 def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> list[str]:
     empty = [line for line in lines if not line.found]
     if not empty:
         return []
-    why = [(line.label, failed[line.recipe.name]) for line in empty if line.recipe and line.recipe.name in failed]
+    why = [
+        (line.label, failed[line.recipe.name])
+        for line in empty
+        if line.recipe and line.recipe.name in failed
+    ]
     reasons = [f"- {markdown_text(label)}: {markdown_text(reason)}" for label, reason in why]
     names = ", ".join(dict.fromkeys(line.row for line in empty))
     return [f"Not measured here: {markdown_text(names)}. To fill: `{command}`", *reasons, ""]
@@ -481,7 +590,8 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
     rows = [
         {
             "Better in the paper": ordering.better,
-            "Worse in the paper": ordering.worse + ("" if ordering.same_track else f" {_TRACKS_DIFFER}"),
+            "Worse in the paper": ordering.worse
+            + ("" if ordering.same_track else f" {_TRACKS_DIFFER}"),
             f"Worse minus better, mm, {BY_THE_PAPER}": f"{ordering.paper_gap_mm:+.2f}",
             f"Worse minus better, mm, {MEASURED_HERE}": f"{ordering.here.mean_mm:+.2f}",
             "95% interval": ordering.here.between,
@@ -492,9 +602,16 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
         for ordering in judged
     ]
     parts += [*Table.of("", rows, (0, 1, 7)).markdown(), ""]
-    how = "intervals by bootstrap over objects and the seeds that both rows have; p by sign flips of the objects'"
-    parts += [f"Differences object by object; {how} differences, with Holm's correction over these pairs."]
+    how = (
+        "intervals by bootstrap over objects and the seeds that both rows have; p by sign flips of "
+        "the objects'"
+    )
+    parts += [
+        f"Differences object by object; {how} differences, with Holm's correction over these pairs."
+    ]
     if not all(ordering.same_track for ordering in judged):
-        difference = "one of the two was given the test sample's range, which is part of the difference."
+        difference = (
+            "one of the two was given the test sample's range, which is part of the difference."
+        )
         parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {difference}"]
     return parts

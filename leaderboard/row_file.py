@@ -1,5 +1,6 @@
-"""A row file: what the leaderboard needs of a result of ``fpp-eval``, in at most 12 KB, as a strict model that checks
-itself. Its means of objects are all that ranks need; the whole result is published elsewhere and found by its hash."""
+"""A row file: what the leaderboard needs of a result of ``fpp-eval``, in at most 12 KB, as a strict
+model that checks itself. Its means of objects are all that ranks need; the whole result is
+published elsewhere and found by its hash."""
 
 import json
 import math
@@ -58,25 +59,28 @@ ROUNDED_TWICE = 2 * _ROUNDED
 """Relative difference between a rounded mean of errors and a mean of rounded errors, at most."""
 _MARKS = ("Mn", "Me")
 """Categories of the combining characters that are drawn on a letter."""
-# Default-ignorable code points that are no format characters, which no text of a submission may hold anyway, blanks
-# that are no spaces, and code points that each font shows as it likes.
+# Default-ignorable code points that are no format characters, which no text of a submission may
+# hold anyway, blanks that are no spaces, and code points that each font shows as it likes.
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180d\u180f\u2065\u2800\u3164\ufe00-\ufe0f\uffa0\ufff0-\ufff8\ufffc"
     "\ue000-\uf8ff\U00013440-\U00013455\U00016fe4\U0001d159\U000e0000-\U0010ffff]"
 )
 _DIACRITICS = re.compile("[\u0300-\u036f\u1ab0-\u1aff\u1dc0-\u1dff\u20d0-\u20ff\ufe20-\ufe2f]")
 _TWINS = (
-    "aаαɑᴀⲁ bвьβʙᏼꓐ cсϲᴄⲥᏟꓚ dԁᴅᎠꓓᏧꓒđ eеєεҽᴇᎬꓰⲉ fғꜰꓝ gɡԍցɢᏀꓖ hһнհʜᎻꓧⲏħ jјϳյᴊᎫꓙ kкκᴋᏦꓗⲕ mмᴍᎷꓟⲙ nпոɴꓠⲛ "
-    "l1i|іιıɩɪǀӏןוا∣│׀ɨłƚʟլᎥᏞꓡꓲⵏ١۱ⲓ o0оοᴏօσסهⲟⵔꓳ০०੦૦௦౦೦൦๐໐၀٥۵ø pрρᴘᏢꓑⲣ qԛզգ rгʀᏒꓣᴦⲅ sѕꜱտᏚᏕꓢ tтτᴛᎢꓔⲧŧ "
+    "aаαɑᴀⲁ bвьβʙᏼꓐ cсϲᴄⲥᏟꓚ dԁᴅᎠꓓᏧꓒđ eеєεҽᴇᎬꓰⲉ fғꜰꓝ gɡԍցɢᏀꓖ hһнհʜᎻꓧⲏħ jјϳյᴊᎫꓙ kкκᴋᏦꓗⲕ mмᴍᎷꓟⲙ "
+    "nпոɴꓠⲛ "
+    "l1i|іιıɩɪǀӏןוا∣│׀ɨłƚʟլᎥᏞꓡꓲⵏ١۱ⲓ o0оοᴏօσסهⲟⵔꓳ০०੦૦௦౦೦൦๐໐၀٥۵ø pрρᴘᏢꓑⲣ qԛզգ rгʀᏒꓣᴦⲅ sѕꜱտᏚᏕꓢ "
+    "tтτᴛᎢꓔⲧŧ "
     "uսᴜꓴ vѵᴠᏙꓦ wԝωաᴡᏔᏯꓪѡ xхχꓫⲭ yуγүʏᎩꓬⲩყ zζᴢᏃꓜ 3зӡʒ 6б -‐‒–—―−⁃˗ '’‘ʼʹ′`´ ,‚، .·•‧∙⋅ !ǃ"
 )
-"""Small characters that look the same, or whose capitals do, behind the one that stands for all of them: out of
-Unicode's confusables (UTS 39), those of a Latin letter, figure or sign."""
+"""Small characters that look the same, or whose capitals do, behind the one that stands for all of
+them: out of Unicode's confusables (UTS 39), those of a Latin letter, figure or sign."""
 
 
 class ObjectMeans(Headline, SparseModel):
-    """An object: means over its ``samples`` views of the errors of `RANKED`, in mm, and over all views how many pixels
-    count. ``without_object`` and ``without_background``: views whose set is empty, which are in no mean of it."""
+    """An object: means over its ``samples`` views of the errors of `RANKED`, in mm, and over all
+    views how many pixels count. ``without_object`` and ``without_background``: views whose set is
+    empty, which are in no mean of it."""
 
     SPARSE: ClassVar[tuple[str, ...]] = ("two_sided_mae_mm", "without_object", "without_background")
 
@@ -102,9 +106,9 @@ class ObjectMeans(Headline, SparseModel):
 
 
 class RowUncertainty(StrictModel):
-    """Of a stated uncertainty: share of object pixels within the stated 95% interval, to which those that state none
-    do not belong; AUSE, and MAE and RMSE of the surest 95% of all object pixels, in mm, null in older files; the rules
-    are in PROTOCOL.md."""
+    """Of a stated uncertainty: share of object pixels within the stated 95% interval, to which
+    those that state none do not belong; AUSE, and MAE and RMSE of the surest 95% of all object
+    pixels, in mm, null in older files; the rules are in PROTOCOL.md."""
 
     within_95_share: Share | None = None
     ause_mae_mm: NonNegative | None = None
@@ -113,8 +117,8 @@ class RowUncertainty(StrictModel):
 
 
 class RowRobustness(StrictModel):
-    """`Robustness` in brief: ``clean_mae_mm`` is that of the undisturbed scene, ``axes`` and ``beside`` are means over
-    severities."""
+    """`Robustness` in brief: ``clean_mae_mm`` is that of the undisturbed scene, ``axes`` and
+    ``beside`` are means over severities."""
 
     version: AxesVersion
     mae_mm: NonNegative
@@ -136,9 +140,10 @@ class RowRobustness(StrictModel):
 
 
 class Row(SparseModel):
-    """What is ranked of a result. Means have `DIGITS` significant digits. ``submission`` has its run time only in
-    ``timing`` where that is there. ``predictions_sha256`` is over the sorted hashes of the prediction files;
-    ``result_sha256`` finds the full result, wherever it is published."""
+    """What is ranked of a result. Means have `DIGITS` significant digits. ``submission`` has its
+    run time only in ``timing`` where that is there. ``predictions_sha256`` is over the sorted
+    hashes of the prediction files; ``result_sha256`` finds the full result, wherever it is
+    published."""
 
     SPARSE = ("uncertainty", "reliance", "robustness", "charge_mm")
 
@@ -175,7 +180,8 @@ class Row(SparseModel):
 
     @property
     def timing(self) -> Timing | None:
-        """What `fpp-bench time` measured, or what the submission reports; None where it reports nothing."""
+        """What `fpp-bench time` measured, or what the submission reports; None where it reports
+        nothing."""
         return self.submission.timing
 
     @property
@@ -187,14 +193,23 @@ class Row(SparseModel):
     def _consistent(self) -> "Row":
         if problem := name_problem(self.submission.name):
             raise ValueError(f"submission.name: {problem}")
-        if (self.frames_class == protocol.FRAMES_CLASSES[0]) != (len(self.submission.frames_used) == 1):
-            raise ValueError(f"frames_class is {self.frames_class}, of {len(self.submission.frames_used)} frames_used")
+        if (self.frames_class == protocol.FRAMES_CLASSES[0]) != (
+            len(self.submission.frames_used) == 1
+        ):
+            raise ValueError(
+                f"frames_class is {self.frames_class}, of {len(self.submission.frames_used)} "
+                f"frames_used"
+            )
         if len({part.object for part in self.per_object}) != len(self.per_object):
             raise ValueError("per_object names an object twice")
         if (samples := sum(part.samples for part in self.per_object)) != self.dataset.samples:
-            raise ValueError(f"per_object holds {samples} samples, dataset.samples says {self.dataset.samples}")
+            raise ValueError(
+                f"per_object holds {samples} samples, dataset.samples says {self.dataset.samples}"
+            )
         if samples > protocol.MOST_SAMPLES:
-            raise ValueError(f"dataset.samples: expected at most {protocol.MOST_SAMPLES}, got {samples}")
+            raise ValueError(
+                f"dataset.samples: expected at most {protocol.MOST_SAMPLES}, got {samples}"
+            )
         benchmark = self.dataset.known
         if benchmark is not None and self.dataset.size != benchmark.image_size:
             expected = f"{benchmark.title} has images of {benchmark.image_size}"
@@ -203,17 +218,29 @@ class Row(SparseModel):
         for part in self.per_object:
             _check_object(part, pixels)
         for key in RANKED:
-            _check_follows(f"metrics.{key}", getattr(self.metrics, key), mean_over(self.per_object, key))
+            _check_follows(
+                f"metrics.{key}", getattr(self.metrics, key), mean_over(self.per_object, key)
+            )
             ends = interval_over(self.per_object, key) or (None, None)
             for stored, computed in zip(self.intervals.of(key) or (None, None), ends, strict=True):
                 _check_follows(f"intervals.{key}", stored, computed)
         void = sum(part.void_pixels for part in self.per_object) / (samples * pixels)
-        _check_follows("metrics.void_share", self.metrics.void_share, void if self.mode == "standard" else None)
-        if problem := self.metrics.problem(samples, _ROUNDED, self.charge_mm) or self._other_problem():
+        _check_follows(
+            "metrics.void_share", self.metrics.void_share, void if self.mode == "standard" else None
+        )
+        if (
+            problem := self.metrics.problem(samples, _ROUNDED, self.charge_mm)
+            or self._other_problem()
+        ):
             raise ValueError(f"metrics: {problem}")
         if self.protocol_version == protocol.PROTOCOL_VERSION:
             found = {
-                p.object: Counts(p.samples, p.object_pixels, p.void_pixels, p.without_object + p.without_background)
+                p.object: Counts(
+                    p.samples,
+                    p.object_pixels,
+                    p.void_pixels,
+                    p.without_object + p.without_background,
+                )
                 for p in self.per_object
             }
             check_data(self.dataset, self.target, self.mode, self.submission.units, found)
@@ -223,7 +250,8 @@ class Row(SparseModel):
         return self
 
     def _other_problem(self) -> str | None:
-        """What of a stated uncertainty, and of the error beside the depth range, contradicts the object's errors."""
+        """What of a stated uncertainty, and of the error beside the depth range, contradicts the
+        object's errors."""
         scores, sure = self.metrics, self.uncertainty or RowUncertainty()
         if scores.object_mae_mm is None:
             return None
@@ -234,11 +262,23 @@ class Row(SparseModel):
             wholes = scores.two_sided_mae_mm, None
         for power, (name, whole) in enumerate(zip(("mae", "rmse"), wholes, strict=True), start=1):
             value = getattr(sure, f"sure_{name}_mm")
-            if None not in (whole, value) and not can_mix(whole, (0.0, unsure), value, left_out, power, _ROUNDED):
-                return f"the error of all pixels does not follow from uncertainty.sure_{name}_mm and the largest one"
+            if None not in (whole, value) and not can_mix(
+                whole, (0.0, unsure), value, left_out, power, _ROUNDED
+            ):
+                return (
+                    f"the error of all pixels does not follow from uncertainty.sure_{name}_mm and "
+                    f"the largest one"
+                )
         share, (near, far) = scores.object_mae_range_share, WORKING_RANGE_MM
-        if self.dataset.known and share is not None and exceeds(scores.object_mae_mm, share * (far - near), _ROUNDED):
-            return f"object_mae_range_share: no object of the benchmark is deeper than {far - near:g} mm"
+        if (
+            self.dataset.known
+            and share is not None
+            and exceeds(scores.object_mae_mm, share * (far - near), _ROUNDED)
+        ):
+            return (
+                f"object_mae_range_share: no object of the benchmark is deeper than {far - near:g} "
+                f"mm"
+            )
         return None
 
 
@@ -250,29 +290,38 @@ def _check_follows(name: str, stored: float | None, computed: float | None) -> N
 
 
 def _check_object(part: ObjectMeans, pixels: int) -> None:
-    """Refuse (ValueError) an object whose sets do not make up ``pixels`` a view, or whose scores contradict them."""
+    """Refuse (ValueError) an object whose sets do not make up ``pixels`` a view, or whose scores
+    contradict them."""
     name = printable(part.object)
     if part.object_pixels + part.background_pixels + part.void_pixels != part.samples * pixels:
-        raise ValueError(f"{name}: object, background and void pixels do not add up to {part.samples} images")
+        raise ValueError(
+            f"{name}: object, background and void pixels do not add up to {part.samples} images"
+        )
     for pixel_set in protocol.PIXEL_SETS:
         mae, rmse = (getattr(part, f"{pixel_set}_{error}_mm") for error in ("mae", "rmse"))
         count = getattr(part, f"{pixel_set}_pixels", part.object_pixels + part.background_pixels)
         if not (count == 0) == (mae is None) == (rmse is None):
-            raise ValueError(f"{name}: {pixel_set} scores must be null exactly when the set is empty")
+            raise ValueError(
+                f"{name}: {pixel_set} scores must be null exactly when the set is empty"
+            )
         if count and not part.views(pixel_set) <= count <= part.views(pixel_set) * pixels:
             views = part.views(pixel_set)
             raise ValueError(
-                f"{name}: {count} {pixel_set} pixels are not those of {views} views, or no view has the set"
+                f"{name}: {count} {pixel_set} pixels are not those of {views} views, or no view "
+                f"has the set"
             )
         if mae is not None and exceeds(mae, rmse, _ROUNDED):
             raise ValueError(f"{name}: {pixel_set} RMSE is below its MAE, which no error has")
     scored = max(pixels - part.void_pixels, 1)  # of a view, at least
     shares = part.object_pixels / scored, part.background_pixels / scored
     for power, error in enumerate(("mae", "rmse"), start=1):
-        whole, inside, outside = (getattr(part, f"{pixel_set}_{error}_mm") or 0.0 for pixel_set in protocol.PIXEL_SETS)
+        whole, inside, outside = (
+            getattr(part, f"{pixel_set}_{error}_mm") or 0.0 for pixel_set in protocol.PIXEL_SETS
+        )
         if not can_mix(whole, (inside, inside), outside, shares, power, _ROUNDED):
             raise ValueError(
-                f"{name}: overall {error.upper()} does not follow from object, background and their pixels"
+                f"{name}: overall {error.upper()} does not follow from object, background and "
+                f"their pixels"
             )
 
 
@@ -289,15 +338,16 @@ def interval_over(objects: Iterable[ObjectMeans], key: str) -> tuple[float, floa
 
 
 def view_means(objects: Iterable[ObjectMeans], key: str) -> Iterator[tuple[str, float]]:
-    """An object's name and mean for each of its views: the bootstrap needs no more of them than their sum."""
+    """An object's name and mean for each of its views: the bootstrap needs no more of them than
+    their sum."""
     for part in objects:
         if (mean := getattr(part, key)) is not None:
             yield from [(part.object, mean)] * part.views(key)
 
 
 def name_key(name: str) -> str:
-    """What two names share that look the same: compatible forms and twins of other scripts, ignoring diacritics, letter
-    case, spaces, and dots at the ends."""
+    """What two names share that look the same: compatible forms and twins of other scripts,
+    ignoring diacritics, letter case, spaces, and dots at the ends."""
     key = unicodedata.normalize("NFKD", name).casefold().translate(_twins())
     key = _DIACRITICS.sub("", key).replace("rn", "m").replace("vv", "w")
     return " ".join(key.split()).strip(". ")
@@ -309,8 +359,8 @@ def _twins() -> dict[int, str]:
 
 
 def looks_like(name: str, other: str) -> bool:
-    """Whether ``name`` has the `name_key` of ``other``, or one that differs in letters only, less than half of them,
-    that are no Latin ones: `_TWINS` does not have all scripts."""
+    """Whether ``name`` has the `name_key` of ``other``, or one that differs in letters only, less
+    than half of them, that are no Latin ones: `_TWINS` does not have all scripts."""
     key, of_other = name_key(name), name_key(other)
     if key == of_other or key.isascii() or len(key) != len(of_other):
         return key == of_other
@@ -336,7 +386,16 @@ def row_content(result: Result, digits: int | None = DIGITS) -> dict[str, Any]:
     if result.timing is not None:  # it names the same time, machine and software
         described |= dict.fromkeys(("seconds_per_sample", "seconds_source", "hardware"))
         described["software"] = {} if result.timing.software else described["software"]
-    kept = {"dataset", "frames_class", "target", "mode", "edge_band_px", "charge_mm", "protocol_version", "created"}
+    kept = {
+        "dataset",
+        "frames_class",
+        "target",
+        "mode",
+        "edge_band_px",
+        "charge_mm",
+        "protocol_version",
+        "created",
+    }
     hashes = sorted(sample.prediction_sha256 for sample in result.per_sample)
     content = {
         "row_schema_version": ROW_SCHEMA_VERSION,
@@ -360,13 +419,17 @@ def row_content(result: Result, digits: int | None = DIGITS) -> dict[str, Any]:
 
 
 def row_of(result: Result, path: Path) -> Row:
-    """The row of ``result``, which is in the file ``path``. SubmissionError for what can't be a row."""
+    """The row of ``result``, which is in the file ``path``. SubmissionError for what can't be a
+    row."""
     return validate(Row, row_content(result), path, "result for the leaderboard")
 
 
 def _object_means(result: Result, part: ObjectResult) -> dict[str, Any]:
     views = [sample for sample in result.per_sample if sample.object == part.object]
-    counts = {name: [getattr(v, f"{name}_pixels") or 0 for v in views] for name in ("object", "background", "void")}
+    counts = {
+        name: [getattr(v, f"{name}_pixels") or 0 for v in views]
+        for name in ("object", "background", "void")
+    }
     return {
         "object": part.object,
         "samples": part.samples,
@@ -378,13 +441,18 @@ def _object_means(result: Result, part: ObjectResult) -> dict[str, Any]:
 
 def _uncertainty(block: Uncertainty) -> dict[str, float | None]:
     samples = [scores for scores in block.per_sample.values() if scores.unstated_share is not None]
-    covered = [(scores.coverage_95 or 0.0) * (1 - (scores.unstated_share or 0.0)) for scores in samples]
-    errors = {key: getattr(block.metrics, key) for key in ("ause_mae_mm", "sure_mae_mm", "sure_rmse_mm")}
+    covered = [
+        (scores.coverage_95 or 0.0) * (1 - (scores.unstated_share or 0.0)) for scores in samples
+    ]
+    errors = {
+        key: getattr(block.metrics, key) for key in ("ause_mae_mm", "sure_mae_mm", "sure_rmse_mm")
+    }
     return {"within_95_share": fmean(covered) if covered else None, **errors}
 
 
 def in_brief(block: Reliance | Robustness) -> dict[str, Any]:
-    """What a row holds of a block: a reliance in four digits, of a robustness the content of a `RowRobustness`."""
+    """What a row holds of a block: a reliance in four digits, of a robustness the content of a
+    `RowRobustness`."""
     content = block.model_dump(mode="json")
     if isinstance(block, Robustness):
         axes, beside = (
@@ -402,18 +470,24 @@ def rounded(value: Any, digits: int | None) -> Any:
         return {key: rounded(inner, digits) for key, inner in value.items()}
     if isinstance(value, list):
         return [rounded(inner, digits) for inner in value]
-    return float(f"{value:.{digits}g}") if isinstance(value, float) and digits is not None else value
+    return (
+        float(f"{value:.{digits}g}") if isinstance(value, float) and digits is not None else value
+    )
 
 
 def row_json(row: Row) -> bytes:
     """The bytes of a row file: JSON with a line for each key."""
     content = row.model_dump(mode="json").items()
-    lines = [f'"{key}": {json.dumps(value, ensure_ascii=False, allow_nan=False)}' for key, value in content]
+    lines = [
+        f'"{key}": {json.dumps(value, ensure_ascii=False, allow_nan=False)}'
+        for key, value in content
+    ]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
 def write_row(row: Row, path: Path) -> bytes:
-    """Write a row file; its bytes. SubmissionError for a row that is too large, or an unwritable path."""
+    """Write a row file; its bytes. SubmissionError for a row that is too large, or an unwritable
+    path."""
     data = row_json(row)
     check_size(data, path)
     write_file(data, path)
@@ -424,7 +498,8 @@ def check_size(data: bytes, path: Path) -> None:
     """Refuse (SubmissionError) a row file of more than `LARGEST_ROW_BYTES`."""
     if len(data) > LARGEST_ROW_BYTES:
         raise SubmissionError(
-            f"{printable(str(path), 500)}: the row has {len(data):,} bytes, expected at most {LARGEST_ROW_BYTES:,}; "
+            f"{printable(str(path), 500)}: the row has {len(data):,} bytes, expected at most "
+            f"{LARGEST_ROW_BYTES:,}; "
             "shorten settings, software or seeds in submission.yaml, and score again"
         )
 

@@ -1,9 +1,10 @@
-"""The leaderboard's rows as they are read: who vouches for each, what recomputing its scores tells, and what is
-measured of a method later (phase reliance, robustness) written into its file.
+"""The leaderboard's rows as they are read: who vouches for each, what recomputing its scores tells,
+and what is measured of a method later (phase reliance, robustness) written into its file.
 
-A result file of ``fpp-eval`` becomes a `Row` when it is read, so that everything here is made of rows. The maintainers
-keep ``vouched.txt``: a line for each row file that they measured themselves, or verified from its author's predictions.
-Nothing in a row says so, and nothing is signed: who can change the list can change the code.
+A result file of ``fpp-eval`` becomes a `Row` when it is read, so that everything here is made of
+rows. The maintainers keep ``vouched.txt``: a line for each row file that they measured themselves,
+or verified from its author's predictions. Nothing in a row says so, and nothing is signed: who can
+change the list can change the code.
 """
 
 import math
@@ -66,7 +67,10 @@ WORDS = {"measured": MEASURED_HERE, "verified": VERIFIED}
 _FIELDS = "SHA-256 of a row file, measured or verified, commit, machine, command"
 _LINE = re.compile(r"([0-9a-f]{64}) \| (measured|verified) \| [0-9a-f]{40} \| [^|\s][^|]* \| \S.*")
 _NOT_COMPARED: Any = {
-    **dict.fromkeys(("created", "package", "git", "code_sha256", "result_sha256", "reliance", "robustness"), True),
+    **dict.fromkeys(
+        ("created", "package", "git", "code_sha256", "result_sha256", "reliance", "robustness"),
+        True,
+    ),
     "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"},
     "dataset": {"name"},
 }
@@ -74,7 +78,8 @@ _NOT_COMPARED: Any = {
 
 @dataclass(frozen=True)
 class Entry:
-    """A row as it was read from a row file or made of a result file, and its ``provenance`` (a key of `MEANING`)."""
+    """A row as it was read from a row file or made of a result file, and its ``provenance`` (a key
+    of `MEANING`)."""
 
     path: Path
     row: Row
@@ -94,7 +99,9 @@ class Entry:
     def is_unseen(self) -> bool:
         """Whether it is scored on the set of unseen objects."""
         benchmark = self.row.dataset.known
-        return benchmark is not None and benchmark.name == UNSEEN and self.row.dataset.split == "test"
+        return (
+            benchmark is not None and benchmark.name == UNSEEN and self.row.dataset.split == "test"
+        )
 
     @property
     def vouched(self) -> bool:
@@ -103,8 +110,8 @@ class Entry:
 
     @property
     def all_checked(self) -> bool:
-        """Whether the maintainers, or this machine's user, also measured what can't be recomputed from predictions:
-        time, phase reliance, robustness. Of others these are self-reported."""
+        """Whether the maintainers, or this machine's user, also measured what can't be recomputed
+        from predictions: time, phase reliance, robustness. Of others these are self-reported."""
         return self.provenance in (MEASURED_HERE, LOCAL)
 
     @property
@@ -115,7 +122,8 @@ class Entry:
 
     @property
     def time_measured(self) -> bool:
-        """Whether this package measured the time and the provenance allows that claim; else it is self-reported."""
+        """Whether this package measured the time and the provenance allows that claim; else it is
+        self-reported."""
         timing, submission = self.row.timing, self.row.submission
         source = timing.provenance if timing is not None else submission.seconds_source
         return source == "measured" and self.all_checked
@@ -130,8 +138,8 @@ class Entry:
 
 
 def read_entry(path: Path) -> Entry:
-    """Read a row file or a result file strictly. SubmissionError names the file and what is wrong with it, also for one
-    of another protocol: its errors follow other rules."""
+    """Read a row file or a result file strictly. SubmissionError names the file and what is wrong
+    with it, also for one of another protocol: its errors follow other rules."""
     content, file = read_json(path), printable(str(path), 500)
     data = file_content(path, _LARGEST_FILE_BYTES, SubmissionError)
     is_row_file = isinstance(content, dict) and "row_schema_version" in content
@@ -146,21 +154,25 @@ def read_entry(path: Path) -> Entry:
         check_size(data, path)
     if row.protocol_version != PROTOCOL_VERSION:
         raise SubmissionError(
-            f"{file}: was scored by protocol {row.protocol_version}, this is {PROTOCOL_VERSION}; score the predictions "
+            f"{file}: was scored by protocol {row.protocol_version}, this is {PROTOCOL_VERSION}; "
+            f"score the predictions "
             "again"
         )
     benchmark = row.dataset.known
     if benchmark is not None and row.metrics.object_mae_mm == 0:
         raise SubmissionError(
-            f"{file}: every error is exactly 0, so the predictions are the ground truth of {benchmark.title} itself; "
-            "score what a method answers (the classical method, from which depth is decoded, against depth_exact)"
+            f"{file}: every error is exactly 0, so the predictions are the ground truth of "
+            f"{benchmark.title} itself; "
+            "score what a method answers (the classical method, from which depth is decoded, "
+            "against depth_exact)"
         )
     shipped = SELF_REPORTED if path.resolve().parent == SHIPPED_ROWS.resolve() else LOCAL
     return Entry(path, row, vouched().get(sha256(data).hexdigest(), shipped), is_row_file)
 
 
 def read_scored(path: Path) -> Result | Row:
-    """The whole result in a result file, the row in a row file, read as strictly as `read_entry` does."""
+    """The whole result in a result file, the row in a row file, read as strictly as `read_entry`
+    does."""
     content = read_json(path)
     is_row_file = isinstance(content, dict) and "row_schema_version" in content
     return read_entry(path).row if is_row_file else parse_result(content, path)
@@ -169,12 +181,15 @@ def read_scored(path: Path) -> Result | Row:
 def alike(first: Result | Row, second: Result | Row) -> tuple[Any, Any]:
     """Two results, or two rows, to be compared: a result beside a row becomes a row."""
     if isinstance(first, Row) != isinstance(second, Row):
-        first, second = (s if isinstance(s, Row) else row_of(s, Path("result")) for s in (first, second))
+        first, second = (
+            s if isinstance(s, Row) else row_of(s, Path("result")) for s in (first, second)
+        )
     return first, second
 
 
 def vouched() -> dict[str, str]:
-    """The provenance that ``vouched.txt`` gives, by SHA-256 of a row file. SubmissionError names a bad line."""
+    """The provenance that ``vouched.txt`` gives, by SHA-256 of a row file. SubmissionError names a
+    bad line."""
     return _vouched(file_content(VOUCHED, 1 << 20, SubmissionError))
 
 
@@ -187,33 +202,42 @@ def _vouched(content: bytes) -> dict[str, str]:
         match = _LINE.fullmatch(line) if line.isprintable() else None
         if match is None or match[1] in listed:
             expected = "a hash that is listed once" if match else f"{_FIELDS}, with | between them"
-            raise SubmissionError(f"{VOUCHED}, line {number}: expected {expected}, got {printable(line)!r}")
+            raise SubmissionError(
+                f"{VOUCHED}, line {number}: expected {expected}, got {printable(line)!r}"
+            )
         listed[match[1]] = WORDS[match[2]]
     return listed
 
 
 def vouching_line(row: Row, data: bytes, word: str, command: str) -> str:
-    """What a maintainer adds to ``vouched.txt`` for a row file of these bytes: ``word`` is of `WORDS`."""
-    machine = "unknown machine" if row.hardware is None else processor(row.hardware).replace("|", "/")
+    """What a maintainer adds to ``vouched.txt`` for a row file of these bytes: ``word`` is of
+    `WORDS`."""
+    machine = (
+        "unknown machine" if row.hardware is None else processor(row.hardware).replace("|", "/")
+    )
     return " | ".join((sha256(data).hexdigest(), word, row.git or 40 * "0", machine, command))
 
 
 def differences(row: Row, folder: Path, dataset: DatasetFolder) -> Verified:
-    """What of ``row`` does not follow from the predictions in ``folder`` on ``dataset``. Everything is scored again;
-    means may differ by what their digits leave open, and by 1e-9. Raises what `evaluate` raises."""
+    """What of ``row`` does not follow from the predictions in ``folder`` on ``dataset``. Everything
+    is scored again; means may differ by what their digits leave open, and by 1e-9. Raises what
+    `evaluate` raises."""
     scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
     rows = row, Row.model_validate(row_content(scored, digits=None))
     stored, computed = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
     cancelling = 1e-9 * (row.metrics.object_mae_mm or 0.0)
     found = list(disagreements(stored, computed, cancelling=cancelling, digits=DIGITS))
-    return Verified(difference_lines(found, "row"), of_processors(found, dataset.rig.working_range_mm[1]))
+    return Verified(
+        difference_lines(found, "row"), of_processors(found, dataset.rig.working_range_mm[1])
+    )
 
 
 def not_checked(about: Row | Result) -> list[str]:
     """What `fpp-eval verify` can't recompute of a row or result, in words."""
     submission = about.submission
     present = {
-        "run time and its machine": (submission.timing or submission.seconds_per_sample) is not None,
+        "run time and its machine": (submission.timing or submission.seconds_per_sample)
+        is not None,
         "phase reliance": about.reliance is not None,
         "robustness": bool(about.robustness),
         "software, code and environment": True,
@@ -222,8 +246,9 @@ def not_checked(about: Row | Result) -> list[str]:
 
 
 def write_block(entry: Entry, block: Reliance | Robustness) -> None:
-    """Put a ``block`` into the file of ``entry``, replacing an earlier value, that of a robustness on the same set; of
-    a row, in brief. Raises SubmissionError for a block that contradicts the result (other weights, other units)."""
+    """Put a ``block`` into the file of ``entry``, replacing an earlier value, that of a robustness
+    on the same set; of a row, in brief. Raises SubmissionError for a block that contradicts the
+    result (other weights, other units)."""
     content = read_json(entry.path)
     plain = in_brief(block) if entry.is_row_file else block.model_dump(mode="json")
     if isinstance(block, Robustness):
@@ -238,7 +263,9 @@ def write_block(entry: Entry, block: Reliance | Robustness) -> None:
 
 def copy_note(copy: Entry, original: Entry) -> str:
     """Why ``copy`` is left out, whose predictions are those of ``original``."""
-    copied, of = (f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (copy, original))
+    copied, of = (
+        f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (copy, original)
+    )
     pairs = ([getattr(e.row.metrics, key) or 0.0 for e in (copy, original)] for key in HEADLINE)
     agree = all(math.isclose(*pair, rel_tol=ROUNDED_TWICE) for pair in pairs)
     contradicting = "" if agree else " but not the same errors, so one of the two files is wrong"

@@ -1,7 +1,8 @@
-"""The leaderboard as tables in the terminal, as Markdown, and as data: JSON with everything, a CSV with a line for each
-row; the same rows give the same bytes. And the tables that were typed in: the paper's own (`fpp_ml_bench.paper`), and
-those of other publications on its dataset, in ``reported_rows.json``. This package did not measure their rows, and they
-are never ranked with measured ones."""
+"""The leaderboard as tables in the terminal, as Markdown, and as data: JSON with everything, a CSV
+with a line for each row; the same rows give the same bytes. And the tables that were typed in: the
+paper's own (`fpp_ml_bench.paper`), and those of other publications on its dataset, in
+``reported_rows.json``. This package did not measure their rows, and they are never ranked with
+measured ones."""
 
 import csv
 import io
@@ -45,17 +46,21 @@ Without arguments, result*.json and results/*.json of the current folder are rea
 """
 PAIRS_FIRST_OUT = ("Objects", "p", "95% interval", "p, Holm")
 LAST_OUT = ("Frames", "s/sample", "x trivial", "Object MAE")
-"""In a narrow terminal, the columns of a ranking that are left out after all others of their width, in this order."""
+"""In a narrow terminal, the columns of a ranking that are left out after all others of their width,
+in this order."""
 _PLAIN = frozenset(" -,+()/%=.")
 _FORMULA = re.compile(r"(?:^|[,;|\t\r\n])(?=[^\w=+@-]*[=+@-])")
-"""Where a cell may begin, at the start of a text or behind what a spreadsheet may split it at, with a sign that begins
-a formula before any letter or digit: behind spaces, quotes, a byte order mark."""
+"""Where a cell may begin, at the start of a text or behind what a spreadsheet may split it at, with
+a sign that begins a formula before any letter or digit: behind spaces, quotes, a byte order
+mark."""
 
 
 REPORTED_HEADING = "Reported by others on other data (not measured here)"
 PAPER_DEPTHS = (
-    "The paper gives its objects a depth of 80 mm in general, and 216 and 465 mm to two in its figures; those of the "
-    "test split here are 262 mm deep at 224 px and 282 mm at 960 px (medians). A network at 224 px does not reproduce "
+    "The paper gives its objects a depth of 80 mm in general, and 216 and 465 mm to two in its "
+    "figures; those of the "
+    "test split here are 262 mm deep at 224 px and 282 mm at 960 px (medians). A network at 224 px "
+    "does not reproduce "
     "the paper's."
 )
 """What is said beside each comparison with the paper."""
@@ -64,8 +69,8 @@ SHOWN_BY_DEFAULT = ("architecture", "normalization", "oracle_order")
 
 @dataclass(frozen=True)
 class ReportedRow:
-    """A row of a table: errors in mm by the keys of `HEADLINE`, as far as they are reported, on ``test_samples`` (view,
-    frame) pairs, None where that is not said."""
+    """A row of a table: errors in mm by the keys of `HEADLINE`, as far as they are reported, on
+    ``test_samples`` (view, frame) pairs, None where that is not said."""
 
     row: str
     label: str
@@ -76,8 +81,9 @@ class ReportedRow:
 
 @dataclass(frozen=True)
 class ReportedTable:
-    """A table of the paper, its rows in the paper's order, or of another ``source``. ``figure``: the ``object`` of the
-    figure beside the table, and ``object_mae_mm`` of one sample of it by row."""
+    """A table of the paper, its rows in the paper's order, or of another ``source``. ``figure``:
+    the ``object`` of the figure beside the table, and ``object_mae_mm`` of one sample of it by
+    row."""
 
     name: str
     title: str
@@ -97,8 +103,12 @@ class ReportedTable:
         source = f"{self.source[0].upper()}{self.source[1:]}"
         said = [f"{source}. Other data, not ranked with the rows above.", *depths, *given]
         if self.figure is not None:
-            errors = ", ".join(f"{row} {error:g}" for row, error in self.figure["object_mae_mm"].items())
-            said.append(f"Its figure, one sample of {self.figure['object']}, object MAE in mm: {errors}.")
+            errors = ", ".join(
+                f"{row} {error:g}" for row, error in self.figure["object_mae_mm"].items()
+            )
+            said.append(
+                f"Its figure, one sample of {self.figure['object']}, object MAE in mm: {errors}."
+            )
         return " ".join(said)
 
 
@@ -109,8 +119,14 @@ def reported_tables() -> dict[str, ReportedTable]:
     tables = {}
     for content in (paper_rows(), others):
         for table in content["tables"]:
-            errors_mm = [dict(zip(content["columns"], row["errors_mm"], strict=True)) for row in table["rows"]]
-            rows = [ReportedRow(**row | {"errors_mm": mm}) for row, mm in zip(table["rows"], errors_mm, strict=True)]
+            errors_mm = [
+                dict(zip(content["columns"], row["errors_mm"], strict=True))
+                for row in table["rows"]
+            ]
+            rows = [
+                ReportedRow(**row | {"errors_mm": mm})
+                for row, mm in zip(table["rows"], errors_mm, strict=True)
+            ]
             source = f"{BY_ITS_AUTHORS} ({table['source']})" if "source" in table else BY_THE_PAPER
             tables[table["name"]] = ReportedTable(**table | {"rows": tuple(rows), "source": source})
     return tables
@@ -118,11 +134,14 @@ def reported_tables() -> dict[str, ReportedTable]:
 
 def paper_tables() -> dict[str, ReportedTable]:
     """The tables of the paper by name."""
-    return {name: table for name, table in reported_tables().items() if table.source == BY_THE_PAPER}
+    return {
+        name: table for name, table in reported_tables().items() if table.source == BY_THE_PAPER
+    }
 
 
 def chosen_tables(choice: str | None) -> list[ReportedTable]:
-    """Tables for ``--paper``: None for those shown by default, ``all``, ``none``, or one table's name."""
+    """Tables for ``--paper``: None for those shown by default, ``all``, ``none``, or one table's
+    name."""
     tables = reported_tables()
     several = {None: SHOWN_BY_DEFAULT, "all": tuple(tables), "none": ()}
     return [tables[name] for name in several.get(choice, (str(choice),))]
@@ -132,7 +151,11 @@ def paper_table(paper: ReportedTable) -> Table:
     """The rows of a table of others, errors with the two decimals of their tables."""
     titles = {
         f"{shown} {error.upper()}": f"{pixels}_{error}_mm"
-        for pixels, shown in (("object", "Object"), ("overall", "Overall"), ("background", "Backgr."))
+        for pixels, shown in (
+            ("object", "Object"),
+            ("overall", "Overall"),
+            ("background", "Backgr."),
+        )
         for error in ("mae", "rmse")
     }
     rows = [
@@ -140,7 +163,10 @@ def paper_table(paper: ReportedTable) -> Table:
             "Row": row.label,
             "Track": row.track,
             "Test samples": "-" if row.test_samples is None else str(row.test_samples),
-            **{title: f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for title, key in titles.items()},
+            **{
+                title: f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-"
+                for title, key in titles.items()
+            },
         }
         for row in paper.rows
     ]
@@ -161,9 +187,12 @@ def pair_row(pair: Pair) -> dict[str, str]:
     }
 
 
-def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked], **look: Any) -> Table:
-    """``rows`` of a ranking with the columns of ``shown`` that any of them has, whose titles take two lines in a
-    terminal, to leave more width for the names; ``look``: further settings of the `Table`."""
+def ranking_table(
+    title: str, shown: Sequence[Column], rows: Sequence[Ranked], **look: Any
+) -> Table:
+    """``rows`` of a ranking with the columns of ``shown`` that any of them has, whose titles take
+    two lines in a terminal, to leave more width for the names; ``look``: further settings of the
+    `Table`."""
     shown = [column for column in shown if column.shown_for(rows)]
     words = [number for number, column in enumerate(shown) if not column.right]
     cells = [{_two_lines(column.title): column.text(row) for column in shown} for row in rows]
@@ -171,22 +200,36 @@ def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked], *
 
 
 def group_tables(groups: Sequence[Group], with_pairs: bool = False) -> list[Table | Text]:
-    """A table for each group, ``with_pairs`` a second one of its pairs; without groups, how to begin."""
+    """A table for each group, ``with_pairs`` a second one of its pairs; without groups, how to
+    begin."""
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
     for group in groups:
         shown = [column for column in columns(group.sort) if column.from_width < ONLY_IN_FILES]
-        names = 1 + [column.title for column in shown if column.shown_for(group.rows)].index(METHOD.title)
+        names = 1 + [column.title for column in shown if column.shown_for(group.rows)].index(
+            METHOD.title
+        )
         rightmost = shown[::-1]  # of equal importance, the rightmost is left out first
-        first_out = [_two_lines(column.title) for column in sorted(rightmost, key=partial(_importance, group.sort))]
+        first_out = [
+            _two_lines(column.title)
+            for column in sorted(rightmost, key=partial(_importance, group.sort))
+        ]
         parts += [ranking_table(group.title, shown, group.rows, names=names, first_out=first_out)]
         parts += [Text("".join(f"{note}\n" for note in group.notes))]
         if with_pairs and len(group.ranked) > MOST_PAIRED:
-            parts.append(Text(f"The pairs of more than {MOST_PAIRED} ranked rows are not listed.\n"))
+            parts.append(
+                Text(f"The pairs of more than {MOST_PAIRED} ranked rows are not listed.\n")
+            )
         elif with_pairs and group.pairs:
             rows = [*map(pair_row, group.pairs)]
-            pairs = Table.of("Pairs of these rows", rows, names=2, first_out=PAIRS_FIRST_OUT, elsewhere="--json FILE")
+            pairs = Table.of(
+                "Pairs of these rows",
+                rows,
+                names=2,
+                first_out=PAIRS_FIRST_OUT,
+                elsewhere="--json FILE",
+            )
             parts.append(pairs)
     return [*parts, Text(f"{NOTE}\n")]
 
@@ -196,9 +239,14 @@ def _two_lines(title: str) -> str:
 
 
 def _importance(sort: str, column: Column) -> tuple[bool, int, int]:
-    """Sort key of the columns: those of a low importance are left out first. What rows are sorted by stays longest."""
+    """Sort key of the columns: those of a low importance are left out first. What rows are sorted
+    by stays longest."""
     is_sorted_by = getattr(column.text, "args", None) == (sort,)
-    return is_sorted_by, -column.from_width, LAST_OUT.index(column.title) if column.title in LAST_OUT else -1
+    return (
+        is_sorted_by,
+        -column.from_width,
+        LAST_OUT.index(column.title) if column.title in LAST_OUT else -1,
+    )
 
 
 def paper_rich_tables(papers: Sequence[ReportedTable]) -> list[Table | Text]:
@@ -226,14 +274,16 @@ def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable]) -> str:
 
 
 def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable]) -> str:
-    """The whole leaderboard as JSON: groups of rows with the tests of their pairs, and the tables of others apart. A
-    table of more than `MOST_PAIRED` ranked rows has no list of pairs."""
+    """The whole leaderboard as JSON: groups of rows with the tests of their pairs, and the tables
+    of others apart. A table of more than `MOST_PAIRED` ranked rows has no list of pairs."""
     of_groups = [
         {
             **asdict(group.key),
             "title": group.title,
             "sorted_by": group.sort,
-            "rows": [{**_cells(group, row), "parts": list(map(_part, row.entries))} for row in group.rows],
+            "rows": [
+                {**_cells(group, row), "parts": list(map(_part, row.entries))} for row in group.rows
+            ],
             "pairs": list(map(asdict, group.pairs)) if len(group.ranked) <= MOST_PAIRED else None,
             "notes": group.notes,
         }
@@ -248,8 +298,8 @@ def _part(entry: Entry) -> dict[str, Any]:
 
 
 def table_csv(groups: Sequence[Group]) -> str:
-    """A line for each row, numbers with all digits, empty where there is none. Text that a spreadsheet would take for a
-    formula, also behind a semicolon, has an apostrophe before it."""
+    """A line for each row, numbers with all digits, empty where there is none. Text that a
+    spreadsheet would take for a formula, also behind a semicolon, has an apostrophe before it."""
     lines = [_cells(group, row) for group in groups for row in group.rows]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(lines[0]) if lines else [], lineterminator="\n")
@@ -260,8 +310,8 @@ def table_csv(groups: Sequence[Group]) -> str:
 
 
 def _plain(value: object) -> object:
-    """A cell of which no spreadsheet runs a part, whatever it splits lines at, whatever stands before a formula, and in
-    whichever width its sign is written."""
+    """A cell of which no spreadsheet runs a part, whatever it splits lines at, whatever stands
+    before a formula, and in whichever width its sign is written."""
     if not isinstance(value, str):
         return value
     narrow = "".join(unicodedata.normalize("NFKC", letter)[:1] for letter in value)

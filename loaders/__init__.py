@@ -1,6 +1,7 @@
-"""Datasets: generate or import fringe stacks, store them as Arrow shards, read them. ``load_dataset(FOLDER, CONFIG,
-split=...)`` gives a ``datasets.Dataset`` on the memory-mapped shards; ``DatasetFolder`` gives single images as NumPy
-arrays; ``FringeDepthDataset`` gives torch tensors for training."""
+"""Datasets: generate or import fringe stacks, store them as Arrow shards, read them.
+``load_dataset(FOLDER, CONFIG, split=...)`` gives a ``datasets.Dataset`` on the memory-mapped
+shards; ``DatasetFolder`` gives single images as NumPy arrays; ``FringeDepthDataset`` gives torch
+tensors for training."""
 
 
 def __getattr__(name: str) -> object:

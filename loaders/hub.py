@@ -1,11 +1,11 @@
-"""Datasets on the Hugging Face Hub. A folder of staged files: what publishing would change, and sending it. Staging a
-dataset: Parquet that the Hub's viewer shows, meshes, rig, and the head of the card. And of a dataset of the published
-layout the files that an import reads, and downloading them into the cache of ``huggingface_hub``, where a download that
-was stopped continues.
+"""Datasets on the Hugging Face Hub. A folder of staged files: what publishing would change, and
+sending it. Staging a dataset: Parquet that the Hub's viewer shows, meshes, rig, and the head of the
+card. And of a dataset of the published layout the files that an import reads, and downloading them
+into the cache of ``huggingface_hub``, where a download that was stopped continues.
 
-Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small one), so a dry run
-can tell what would change. Every error of the client becomes a `PublishError` that says what to do; the client reads
-``HF_ENDPOINT``, ``HF_TOKEN`` and ``HF_HUB_OFFLINE`` itself.
+Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small
+one), so a dry run can tell what would change. Every error of the client becomes a `PublishError`
+that says what to do; the client reads ``HF_ENDPOINT``, ``HF_TOKEN`` and ``HF_HUB_OFFLINE`` itself.
 """
 
 import json
@@ -40,13 +40,26 @@ from huggingface_hub.utils.sha import git_hash
 from fpp_ml_bench import __version__
 from fpp_ml_bench.constants import FULL_SIZE, REPOSITORY_NAME
 from fpp_ml_bench.errors import DatasetError, LayoutError, PublishError, RemoteError
-from fpp_ml_bench.files import LOCK_FILE, check_space, exclusive, printable, read_json, write_atomically
+from fpp_ml_bench.files import (
+    LOCK_FILE,
+    check_space,
+    exclusive,
+    printable,
+    read_json,
+    write_atomically,
+)
 from fpp_ml_bench.loaders.published.importing import Source
 from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
 from fpp_ml_bench.loaders.storage.card import NAME, RIG_FILE, front_matter
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, damage_of
-from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, overview, published_features, write_shard
+from fpp_ml_bench.loaders.storage.parquet import (
+    card_configs,
+    data_shards,
+    overview,
+    published_features,
+    write_shard,
+)
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig_file import save_rig
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
@@ -56,9 +69,11 @@ Kind = Literal["dataset", "space", "model"]
 Status = Literal["new", "changed", "unchanged", "deleted"]
 
 MARK = "fpp-bench.json"
-"""File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
+"""File that marks a repository as published by this command, and says what it holds: the next run
+may replace it."""
 ANSWER_S = 45
-"""A question to the Hub is answered within so many seconds, or nobody is there; files take as long as they take."""
+"""A question to the Hub is answered within so many seconds, or nobody is there; files take as long
+as they take."""
 _BATCH_FILES = 8
 """Files are sent before the commit so many at a time, for the progress bar."""
 _ANSWERS = {
@@ -84,9 +99,9 @@ class Unreachable(PublishError, RemoteError):
 
 @dataclass(frozen=True)
 class Publication:
-    """Files staged for a repository; every file below ``folder`` is part of it, hidden files included. ``owned`` are
-    folders (ending in ``/``) that only this publication fills: any other file in them is deleted. ``message`` is the
-    commit message."""
+    """Files staged for a repository; every file below ``folder`` is part of it, hidden files
+    included. ``owned`` are folders (ending in ``/``) that only this publication fills: any other
+    file in them is deleted. ``message`` is the commit message."""
 
     kind: Kind
     repo: str
@@ -97,8 +112,8 @@ class Publication:
 
 @dataclass(frozen=True)
 class Remote:
-    """The current state of a repository: ``commit`` is None where it does not exist, or this token may not see it, or
-    the Hub was not ``asked``."""
+    """The current state of a repository: ``commit`` is None where it does not exist, or this token
+    may not see it, or the Hub was not ``asked``."""
 
     commit: str | None
     private: bool = False
@@ -112,7 +127,8 @@ class Remote:
 
 @dataclass(frozen=True)
 class Change:
-    """The change of a file; ``bytes`` is its size after the change, or before it where the file is deleted."""
+    """The change of a file; ``bytes`` is its size after the change, or before it where the file is
+    deleted."""
 
     status: Status
     path: str
@@ -126,7 +142,8 @@ def mark_bytes(publishes: str, **about: Any) -> bytes:
 
 
 def staged_files(folder: Path) -> dict[str, Path]:
-    """Every file below a staged folder by its path in the repository, sorted. Raises `PublishError` for a link."""
+    """Every file below a staged folder by its path in the repository, sorted. Raises `PublishError`
+    for a link."""
     files: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.is_symlink():
@@ -137,11 +154,17 @@ def staged_files(folder: Path) -> dict[str, Path]:
 
 
 def changes(publication: Publication, remote: Remote) -> list[Change]:
-    """What publishing does to each file of ``publication``, sorted by path, and what it deletes. Reads every staged
-    file once. Other files of the repository outside ``owned`` stay as they are."""
+    """What publishing does to each file of ``publication``, sorted by path, and what it deletes.
+    Reads every staged file once. Other files of the repository outside ``owned`` stay as they
+    are."""
     staged = staged_files(publication.folder)
-    planned = [Change(_status(at, remote.files.get(name)), name, at.stat().st_size) for name, at in staged.items()]
-    gone = (name for name in remote.files if name not in staged and name.startswith(publication.owned))
+    planned = [
+        Change(_status(at, remote.files.get(name)), name, at.stat().st_size)
+        for name, at in staged.items()
+    ]
+    gone = (
+        name for name in remote.files if name not in staged and name.startswith(publication.owned)
+    )
     planned += [Change("deleted", name, remote.files[name].size) for name in gone]
     return sorted(planned, key=lambda change: change.path)
 
@@ -158,15 +181,20 @@ def _status(path: Path, stored: RepoFile | None) -> Status:
 
 
 def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> None:
-    """Refuse, with `PublishError`, to write into a repository that this command did not fill, unless ``adopt``."""
+    """Refuse, with `PublishError`, to write into a repository that this command did not fill,
+    unless ``adopt``."""
     if adopt or publication.kind == "model" or not remote.exists:
         return
-    foreign = sorted(set(remote.files) - {".gitattributes", "README.md"})  # of one just made on the Hub's web page
+    foreign = sorted(
+        set(remote.files) - {".gitattributes", "README.md"}
+    )  # of one just made on the Hub's web page
     if foreign and MARK not in remote.files:
         named = ", ".join(printable(name, 80) for name in foreign[:3])
         raise PublishError(
-            f"{publication.repo}: this {publication.kind} holds {len(foreign)} files that fpp-bench did not publish "
-            f"({named}, ...); give the name of a new one, or --adopt to publish into it (nothing is deleted outside "
+            f"{publication.repo}: this {publication.kind} holds {len(foreign)} files that "
+            f"fpp-bench did not publish "
+            f"({named}, ...); give the name of a new one, or --adopt to publish into it (nothing "
+            f"is deleted outside "
             f"{', '.join(publication.owned) or 'its own files'})"
         )
 
@@ -175,32 +203,38 @@ def check_repo_name(repo: str) -> str:
     """``repo`` itself when it is an OWNER/NAME that the Hub can have, else `PublishError`."""
     if not REPOSITORY_NAME.fullmatch(repo):
         raise PublishError(
-            f"expected a repository as OWNER/NAME (letters, digits, '-', '_', '.'), got {printable(repo, 80)!r}"
+            f"expected a repository as OWNER/NAME (letters, digits, '-', '_', '.'), got "
+            f"{printable(repo, 80)!r}"
         )
     return repo
 
 
 class Hub:
-    """A connection to the Hub. Its constructor uses no network. Errors are `PublishError`, or, where nothing is to be
-    sent, `RemoteError`."""
+    """A connection to the Hub. Its constructor uses no network. Errors are `PublishError`, or,
+    where nothing is to be sent, `RemoteError`."""
 
     def __init__(self, sending: bool = True) -> None:
         if sending:
             disable_progress_bars()  # ours shows all files together
         self._error = PublishError if sending else RemoteError
         self._participle, self._continues = (
-            ("sent", "it sends only what is missing") if sending else ("downloaded", "it continues where it stopped")
+            ("sent", "it sends only what is missing")
+            if sending
+            else ("downloaded", "it continues where it stopped")
         )
         self._api = HfApi(library_name="fpp-ml-bench", library_version=__version__)
         self.endpoint: str = self._api.endpoint
         if not self.endpoint.startswith(("https://", "http://")):
-            raise self._error(f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}")
+            raise self._error(
+                f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}"
+            )
 
     def url(self, kind: Kind, repo: str) -> str:
         return f"{self.endpoint}/{constants.REPO_TYPES_URL_PREFIXES.get(kind, '')}{repo}"
 
     def check_token(self) -> set[str]:
-        """Names that the token may publish under: its user and their organisations. `PublishError` without a token."""
+        """Names that the token may publish under: its user and their organisations. `PublishError`
+        without a token."""
         with self._explained("asking who the token belongs to"):
             me = _answer(self._api.whoami)
             return {str(me.get("name"))} | {str(org.get("name")) for org in me.get("orgs") or ()}
@@ -209,49 +243,75 @@ class Hub:
         """`PublishError` where the token may not make repositories for the owner of ``repo``."""
         if repo.split("/")[0].lower() not in {name.lower() for name in names}:
             owners = ", ".join(printable(name, 60) for name in sorted(names))
-            raise PublishError(f"{repo}: does not exist, and this token may make repositories of {owners} only")
+            raise PublishError(
+                f"{repo}: does not exist, and this token may make repositories of {owners} only"
+            )
 
     def state(self, kind: Kind, repo: str, revision: str | None = None) -> Remote:
-        """A repository's commit, visibility and files at a branch, tag or commit, by default on its main branch; a
-        `Remote` without a commit where no repository is visible."""
+        """A repository's commit, visibility and files at a branch, tag or commit, by default on its
+        main branch; a `Remote` without a commit where no repository is visible."""
         with self._explained(f"reading {kind} {repo}"):
             try:
                 info = _answer(lambda: self._api.repo_info(repo, repo_type=kind, revision=revision))
             except hub_errors.RevisionNotFoundError as error:
-                raise self._error(f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}") from error
+                raise self._error(
+                    f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}"
+                ) from error
             except hub_errors.GatedRepoError:
                 raise
             except hub_errors.RepositoryNotFoundError as error:
-                # Without a token the Hub answers 401, not 404, for a repository that is private or missing.
+                # Without a token the Hub answers 401, not 404, for a repository that is private or
+                # missing.
                 if error.response.status_code == 401 and get_token():
                     raise
                 return Remote(None)
-            tree = partial(self._api.list_repo_tree, repo, repo_type=kind, recursive=True, revision=info.sha)
-            files = {entry.path: entry for entry in _answer(lambda: list(tree())) if isinstance(entry, RepoFile)}
-            if not all(isinstance(name, str) and isinstance(file.size, int) for name, file in files.items()):
+            tree = partial(
+                self._api.list_repo_tree, repo, repo_type=kind, recursive=True, revision=info.sha
+            )
+            files = {
+                entry.path: entry
+                for entry in _answer(lambda: list(tree()))
+                if isinstance(entry, RepoFile)
+            }
+            if not all(
+                isinstance(name, str) and isinstance(file.size, int) for name, file in files.items()
+            ):
                 raise TypeError("files without names or sizes")
             return Remote(info.sha or "", bool(info.private), files)
 
     def download(self, repo: str, commit: str, patterns: list[str]) -> Path:
-        """Download files of a dataset whose names match ``patterns`` into the client's cache, but for those that are
-        there; returns the folder of the commit in the cache."""
+        """Download files of a dataset whose names match ``patterns`` into the client's cache, but
+        for those that are there; returns the folder of the commit in the cache."""
         with self._explained(f"downloading dataset {repo}"):
-            folder = self._api.snapshot_download(repo, repo_type="dataset", revision=commit, allow_patterns=patterns)
+            folder = self._api.snapshot_download(
+                repo, repo_type="dataset", revision=commit, allow_patterns=patterns
+            )
         return Path(folder)
 
     def mark(self, kind: Kind, repo: str, remote: Remote) -> dict[str, Any]:
-        """Content of `MARK` in a repository; `PublishError` where the file is missing or damaged."""
+        """Content of `MARK` in a repository; `PublishError` where the file is missing or
+        damaged."""
         if not remote.exists:
             raise PublishError(
-                f"{repo}: no such {kind} on {self.endpoint}, or this token may not see it; check the name, or publish "
+                f"{repo}: no such {kind} on {self.endpoint}, or this token may not see it; check "
+                f"the name, or publish "
                 f"it first: fpp-bench publish {kind} ... --repo {repo}"
             )
         if MARK not in remote.files or remote.files[MARK].size > 1 << 20:
-            raise PublishError(f"{repo}: this {kind} was not published by fpp-bench (no {MARK} there)")
-        with tempfile.TemporaryDirectory() as cache, self._explained(f"reading {MARK} of {kind} {repo}"):
-            download = partial(self._api.hf_hub_download, repo, MARK, repo_type=kind, revision=remote.commit)
+            raise PublishError(
+                f"{repo}: this {kind} was not published by fpp-bench (no {MARK} there)"
+            )
+        with (
+            tempfile.TemporaryDirectory() as cache,
+            self._explained(f"reading {MARK} of {kind} {repo}"),
+        ):
+            download = partial(
+                self._api.hf_hub_download, repo, MARK, repo_type=kind, revision=remote.commit
+            )
             path = _answer(lambda: download(cache_dir=cache))
-            about = read_json(Path(path), PublishError, f"it is of {repo}: publish the {kind} again")
+            about = read_json(
+                Path(path), PublishError, f"it is of {repo}: publish the {kind} again"
+            )
         return about if isinstance(about, dict) else {}
 
     def send(
@@ -262,9 +322,10 @@ class Hub:
         private: bool,
         sent: Callable[[int], None] = lambda count: None,
     ) -> str:
-        """Make the repository where there is none, send new and changed files, and commit; returns the commit's URL.
-        All files become visible together; a run after an interrupted one sends only what is missing. ``sent`` is called
-        with the bytes of each batch. Raises `PublishError`, also after a commit by someone else meanwhile."""
+        """Make the repository where there is none, send new and changed files, and commit; returns
+        the commit's URL. All files become visible together; a run after an interrupted one sends
+        only what is missing. ``sent`` is called with the bytes of each batch. Raises
+        `PublishError`, also after a commit by someone else meanwhile."""
         repo, kind = publication.repo, publication.kind
         if not remote.exists:
             with self._explained(f"making {kind} {repo}"):
@@ -277,7 +338,11 @@ class Hub:
                 batch = additions[start : start + _BATCH_FILES]
                 self._api.preupload_lfs_files(repo, batch, repo_type=kind, free_memory=False)
                 sent(sum(addition.upload_info.size for addition in batch))
-            deletions = [CommitOperationDelete(c.path, is_folder=False) for c in changes if c.status == "deleted"]
+            deletions = [
+                CommitOperationDelete(c.path, is_folder=False)
+                for c in changes
+                if c.status == "deleted"
+            ]
             done = self._api.create_commit(
                 repo,
                 [*additions, *deletions],
@@ -296,42 +361,59 @@ class Hub:
             raise Unreachable(f"{doing}: {reason}") from error
         except hub_errors.LocalTokenNotFoundError as error:
             raise PublishError(
-                f"{doing}: no token for the Hub: run 'hf auth login' once or set HF_TOKEN, with a token that may "
+                f"{doing}: no token for the Hub: run 'hf auth login' once or set HF_TOKEN, with a "
+                f"token that may "
                 "write; --dry-run needs none for what is public"
             ) from error
         except hub_errors.GatedRepoError as error:
             raise self._error(
-                f"{doing}: its owner gives it only to those who accept the conditions on its page on {self.endpoint}; "
+                f"{doing}: its owner gives it only to those who accept the conditions on its page "
+                f"on {self.endpoint}; "
                 "accept them there, then run 'hf auth login' once or set HF_TOKEN"
             ) from error
         except hub_errors.HfHubHTTPError as error:
-            status, said = error.response.status_code, " ".join((error.server_message or "").split())
-            fault = f"the Hub has a fault ({status}); run the same command again later, {self._continues}"
+            status, said = (
+                error.response.status_code,
+                " ".join((error.server_message or "").split()),
+            )
+            fault = (
+                f"the Hub has a fault ({status}); run the same command again later, "
+                f"{self._continues}"
+            )
             answer = _ANSWERS.get(status, f"the Hub refused ({status})") if status < 500 else fault
-            raise self._error(f"{doing}: {answer}{f'. The Hub says: {printable(said)}' if said else ''}") from error
+            raise self._error(
+                f"{doing}: {answer}{f'. The Hub says: {printable(said)}' if said else ''}"
+            ) from error
         except (hub_errors.HTTPError, hub_errors.LocalEntryNotFoundError) as error:
             cause = error if isinstance(error, hub_errors.HTTPError) else error.__cause__ or error
             raise Unreachable(
-                f"{doing}: {self.endpoint} can't be reached ({printable(str(cause)) or type(cause).__name__}); check "
+                f"{doing}: {self.endpoint} can't be reached "
+                f"({printable(str(cause)) or type(cause).__name__}); check "
                 f"the network and HF_ENDPOINT, then run the same command again: {self._continues}"
             ) from error
         except TimeoutError as error:
             raise Unreachable(
-                f"{doing}: {self.endpoint} gave no answer within {ANSWER_S} s; check the network and HF_ENDPOINT"
+                f"{doing}: {self.endpoint} gave no answer within {ANSWER_S} s; check the network "
+                f"and HF_ENDPOINT"
             ) from error
         except (AttributeError, TypeError, LookupError) as error:
             raise self._error(
-                f"{doing}: {self.endpoint} gave an answer that is not one of the Hub ({printable(str(error))}); check "
+                f"{doing}: {self.endpoint} gave an answer that is not one of the Hub "
+                f"({printable(str(error))}); check "
                 "HF_ENDPOINT, and whether a proxy answers in its place"
             ) from error
         except (ValueError, RuntimeError, OSError) as error:
-            # The client's refusals of an answer or a card (ValueError), and its transfer library (RuntimeError).
+            # The client's refusals of an answer or a card (ValueError), and its transfer library
+            # (RuntimeError).
             lines = " ".join(printable(line) for line in str(error).splitlines())
-            raise self._error(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
+            raise self._error(
+                f"{doing}: {lines or type(error).__name__}; run the same command again"
+            ) from error
 
 
 def _answer(question: Callable[[], T]) -> T:
-    """What the Hub answers. TimeoutError after `ANSWER_S`: the client itself would wait for ever."""
+    """What the Hub answers. TimeoutError after `ANSWER_S`: the client itself would wait for
+    ever."""
     answer: Future[T] = Future()
 
     def ask() -> None:
@@ -346,9 +428,10 @@ def _answer(question: Callable[[], T]) -> T:
 
 @contextmanager
 def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
-    """Yield the folder for staged files: a temporary folder, or ``files/`` in ``chosen``, kept for the next run.
-    ``identity`` says what is staged. Files that an earlier run left in ``chosen`` are kept for the same identity and
-    removed for another. Raises `PublishError` for a folder that holds anything else, ``OSError`` for a failed write."""
+    """Yield the folder for staged files: a temporary folder, or ``files/`` in ``chosen``, kept for
+    the next run. ``identity`` says what is staged. Files that an earlier run left in ``chosen`` are
+    kept for the same identity and removed for another. Raises `PublishError` for a folder that
+    holds anything else, ``OSError`` for a failed write."""
     if chosen is None:
         with tempfile.TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
             yield Path(folder)
@@ -358,9 +441,13 @@ def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
     writers = f"{__version__} {pyarrow.__version__} {cv2.__version__}"
     expected = sha256(f"{identity}\n{writers}".encode()).hexdigest()
     with exclusive(chosen / LOCK_FILE, chosen, "staging there", PublishError):
-        held = mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
+        held = (
+            mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
+        )
         if held is None and any(path.name != LOCK_FILE for path in chosen.iterdir()):
-            raise PublishError(f"--staging {chosen}: holds files that are not of this command; give a new folder")
+            raise PublishError(
+                f"--staging {chosen}: holds files that are not of this command; give a new folder"
+            )
         if held != expected:
             shutil.rmtree(files, ignore_errors=True)
             write_atomically(mark, f"{expected}\n".encode())
@@ -371,30 +458,45 @@ def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
 
 
 def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
-    """Licence identifier for the card: ``license_id``, or MIT for generated data. `PublishError` for other data."""
+    """Licence identifier for the card: ``license_id``, or MIT for generated data. `PublishError`
+    for other data."""
     origin = dataset.manifest.origin
     if license_id is None and origin != GENERATED:
-        raise PublishError(f"{dataset.path}: {origin} data; say under which --license it may be shared")
+        raise PublishError(
+            f"{dataset.path}: {origin} data; say under which --license it may be shared"
+        )
     licence = license_id or "mit"
     if not _LICENCE.fullmatch(licence):
-        raise PublishError(f"--license: expected an identifier like mit or cc-by-4.0, got {licence!r}")
+        raise PublishError(
+            f"--license: expected an identifier like mit or cc-by-4.0, got {licence!r}"
+        )
     return licence
 
 
 def card_head(dataset: DatasetFolder, licence: str) -> str:
-    """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know configurations and files."""
+    """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know
+    configurations and files."""
     from datasets import DatasetInfo, Features  # takes a second to import
     from datasets.splits import SplitDict, SplitInfo
 
     files: dict[str, list[str]] = {split: [] for split in dataset.splits}
     for name, shard in data_shards(dataset).items():
-        files[shard.split].append(name)  # by name, not by pattern: a stray file can never join the data
+        files[shard.split].append(
+            name
+        )  # by name, not by pattern: a stray file can never join the data
     infos = []
     for config in dataset.configs:
         described = published_features(dataset, config)
-        levels = sum(4 if name in DEPTHS else 1 for name in described if name not in (*LABELS, *RANGE, PREVIEW))
+        levels = sum(
+            4 if name in DEPTHS else 1
+            for name in described
+            if name not in (*LABELS, *RANGE, PREVIEW)
+        )
         row_bytes = dataset.size[0] * dataset.size[1] * levels
-        splits = [SplitInfo(name, row_bytes * len(samples), len(samples)) for name, samples in dataset.splits.items()]
+        splits = [
+            SplitInfo(name, row_bytes * len(samples), len(samples))
+            for name, samples in dataset.splits.items()
+        ]
         info = DatasetInfo(
             features=Features.from_dict(described),
             splits=SplitDict({split.name: split for split in splits}),
@@ -413,15 +515,17 @@ def stage_dataset(
     threads: int = 1,
     row_done: Callable[[int], None] = lambda rows: None,
 ) -> Publication:
-    """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same data, same bytes.
-    Parquet files that are already there are kept (see `staging_folder`). Raises `DatasetError` for a damaged dataset,
-    ``OSError`` when a file can't be written."""
+    """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same
+    data, same bytes. Parquet files that are already there are kept (see `staging_folder`). Raises
+    `DatasetError` for a damaged dataset, ``OSError`` when a file can't be written."""
     for name, shard in data_shards(dataset).items():
         if (folder / name).is_file():
             row_done(shard.rows)
         else:
             write_shard(dataset, shard, folder / name, row_done, threads)
-    for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
+    for mesh in (
+        file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")
+    ):
         if damage := damage_of(dataset.path, mesh):
             raise DatasetError(damage)
         (folder / MESH_FOLDER).mkdir(exist_ok=True)
@@ -430,7 +534,11 @@ def stage_dataset(
     write_atomically(folder / PICTURE, overview(dataset))
     for name, text in texts.items():
         write_atomically(folder / name, text.encode())
-    about = {"fingerprint": dataset.fingerprint, "size": list(dataset.size), "configs": list(dataset.configs)}
+    about = {
+        "fingerprint": dataset.fingerprint,
+        "size": list(dataset.size),
+        "configs": list(dataset.configs),
+    }
     marked = mark_bytes("dataset", **about, splits=dataset.splits, content=dataset.content)
     write_atomically(folder / MARK, marked)
     return Publication("dataset", repo, folder, f"{NAME} dataset {dataset.fingerprint[:12]}", OWNED)
@@ -438,8 +546,9 @@ def stage_dataset(
 
 @dataclass(frozen=True)
 class Download:
-    """What an import downloads from ``source``: ``sizes`` in bytes by name of file, those matched by ``patterns``.
-    ``missing`` are those of them that ``cache`` does not hold, ``raw_scans`` the images that are left out."""
+    """What an import downloads from ``source``: ``sizes`` in bytes by name of file, those matched
+    by ``patterns``. ``missing`` are those of them that ``cache`` does not hold, ``raw_scans`` the
+    images that are left out."""
 
     source: Source
     patterns: tuple[str, ...]
@@ -449,14 +558,18 @@ class Download:
     cache: Path
 
 
-def plan_download(hub: Hub, repository: str, revision: str | None = None, raw_scans: bool = False) -> Download:
-    """What an import of ``repository`` at ``revision`` (branch, tag or commit; None: its main branch) downloads: the
-    depth variant that it reads, the depth ranges and, with ``raw_scans``, the frames of the raw scans. Raises
-    `RemoteError` as `Hub.state`, `LayoutError` for a repository without the published layout or raw scans."""
+def plan_download(
+    hub: Hub, repository: str, revision: str | None = None, raw_scans: bool = False
+) -> Download:
+    """What an import of ``repository`` at ``revision`` (branch, tag or commit; None: its main
+    branch) downloads: the depth variant that it reads, the depth ranges and, with ``raw_scans``,
+    the frames of the raw scans. Raises `RemoteError` as `Hub.state`, `LayoutError` for a repository
+    without the published layout or raw scans."""
     remote = hub.state("dataset", repository, revision)
     if not remote.exists:
         raise RemoteError(
-            f"{repository}: no such folder here, and no such dataset on {hub.endpoint}, or it is private; check the "
+            f"{repository}: no such folder here, and no such dataset on {hub.endpoint}, or it is "
+            f"private; check the "
             "name, or run 'hf auth login' with a token that may read it"
         )
 
@@ -464,7 +577,9 @@ def plan_download(hub: Hub, repository: str, revision: str | None = None, raw_sc
         names = filter_repo_objects(remote.files, allow_patterns=list(patterns))
         return {name: remote.files[name].size for name in names}
 
-    variant = next((name for name in VARIANT_FOLDERS.values() if matching(f"{TRAINING}/{name}/*")), None)
+    variant = next(
+        (name for name in VARIANT_FOLDERS.values() if matching(f"{TRAINING}/{name}/*")), None
+    )
     scans = matching(_SCAN_FRAMES)
     if variant is None:
         hint = f"expected {TRAINING}/ with one of {', '.join(VARIANT_FOLDERS.values())}"
@@ -472,27 +587,41 @@ def plan_download(hub: Hub, repository: str, revision: str | None = None, raw_sc
             hint = f'it holds Parquet files, which datasets.load_dataset("{repository}") opens'
         raise LayoutError(f"{repository}: this dataset does not have the published layout; {hint}")
     if raw_scans and not scans:
-        raise LayoutError(f"{repository}: has no raw scans ({RAW_SCANS}/), only the single-shot images and their depth")
-    patterns = (f"{TRAINING}/{variant}/*", f"{TRAINING}/{INFO}/*", *([_SCAN_FRAMES] if raw_scans else []))
+        raise LayoutError(
+            f"{repository}: has no raw scans ({RAW_SCANS}/), only the single-shot images and their "
+            f"depth"
+        )
+    patterns = (
+        f"{TRAINING}/{variant}/*",
+        f"{TRAINING}/{INFO}/*",
+        *([_SCAN_FRAMES] if raw_scans else []),
+    )
     sizes, commit = matching(*patterns), remote.commit or ""
     missing = {
         name: size
         for name, size in sizes.items()
-        if not isinstance(try_to_load_from_cache(repository, name, revision=commit, repo_type="dataset"), str)
+        if not isinstance(
+            try_to_load_from_cache(repository, name, revision=commit, repo_type="dataset"), str
+        )
     }
     source = Source(repository, commit, (variant, *([RAW_SCANS] if raw_scans else [])))
-    return Download(source, patterns, sizes, missing, {} if raw_scans else scans, Path(constants.HF_HUB_CACHE))
+    return Download(
+        source, patterns, sizes, missing, {} if raw_scans else scans, Path(constants.HF_HUB_CACHE)
+    )
 
 
 def fetch_tree(hub: Hub, download: Download, out: Path) -> Path:
-    """Download what is missing, with the client's own progress bars; returns the folder of the tree in the cache.
-    Raises `BuildError` where a disk has no space for the download and the dataset to be written to ``out``,
-    `RemoteError` as `Hub.download`."""
+    """Download what is missing, with the client's own progress bars; returns the folder of the tree
+    in the cache. Raises `BuildError` where a disk has no space for the download and the dataset to
+    be written to ``out``, `RemoteError` as `Hub.download`."""
     if download.missing:
         # The import is estimated for images of the paper's size.
         frames = len(PAPER_SEQUENCE) if RAW_SCANS in download.source.folders else 1
         samples = sum(f"/{FRINGE}/" in name for name in download.sizes)
-        imported, downloaded = samples * FULL_SIZE**2 * (frames + _DEPTH_BYTES), sum(download.missing.values())
+        imported, downloaded = (
+            samples * FULL_SIZE**2 * (frames + _DEPTH_BYTES),
+            sum(download.missing.values()),
+        )
         cure = " for the download (HF_HOME) or the dataset (--out)"
         check_space({download.cache: downloaded, out: imported}, "download and import need", cure)
     return hub.download(download.source.repository, download.source.commit, list(download.patterns))

@@ -1,4 +1,5 @@
-"""Rows for the leaderboard's tests: results of real scoring with errors, times and names that the test chooses."""
+"""Rows for the leaderboard's tests: results of real scoring with errors, times and names that the
+test chooses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,11 +12,23 @@ from scored_dataset import write_predictions
 from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, WITHIN_MM
 from fpp_ml_bench.evaluation.result.file import write_result
-from fpp_ml_bench.evaluation.result.parts import RELIANCE_VERSION, Intervals, Metrics, Reliance, RelianceParts
+from fpp_ml_bench.evaluation.result.parts import (
+    RELIANCE_VERSION,
+    Intervals,
+    Metrics,
+    Reliance,
+    RelianceParts,
+)
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, combine
 from fpp_ml_bench.leaderboard import ranking
-from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, RowRobustness, interval_over, mean_over
+from fpp_ml_bench.leaderboard.row_file import (
+    ObjectMeans,
+    Row,
+    RowRobustness,
+    interval_over,
+    mean_over,
+)
 from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.storage import benchmark
 from fpp_ml_bench.loaders.storage.benchmark import Benchmark
@@ -46,8 +59,11 @@ def timing(ms: float, frames: int = 1, **changes: Any) -> dict[str, Any]:
     }
 
 
-def write_result_file(path: Path, dataset: Any, offset_mm: float, noise_mm: float = 0.0, **changes: Any) -> Path:
-    """Write the result of predictions off by ``offset_mm`` and noise; ``changes`` go into submission.yaml."""
+def write_result_file(
+    path: Path, dataset: Any, offset_mm: float, noise_mm: float = 0.0, **changes: Any
+) -> Path:
+    """Write the result of predictions off by ``offset_mm`` and noise; ``changes`` go into
+    submission.yaml."""
     folder = path.parent / f"{path.stem}-predictions"
     target = changes.pop("target", "depth")
     write_predictions(folder, dataset, offset_mm=offset_mm, noise_mm=noise_mm, **changes)
@@ -56,11 +72,18 @@ def write_result_file(path: Path, dataset: Any, offset_mm: float, noise_mm: floa
 
 
 def some_rows(folder: Path, dataset: Any) -> list[Path]:
-    """Four results of one class in two tracks: fast and rough, slow and fine, beaten by both, and one that was told."""
+    """Four results of one class in two tracks: fast and rough, slow and fine, beaten by both, and
+    one that was told."""
     folder.mkdir(parents=True, exist_ok=True)
     return [
         write_result_file(
-            folder / "fast.json", dataset, 4.0, 1.0, name="Fast and rough", frames_used=[0, 1], timing=timing(2.0, 2)
+            folder / "fast.json",
+            dataset,
+            4.0,
+            1.0,
+            name="Fast and rough",
+            frames_used=[0, 1],
+            timing=timing(2.0, 2),
         ),
         write_result_file(
             folder / "fine.json",
@@ -102,10 +125,13 @@ def entry_with_errors(
     provenance: str | None = None,
     **about: Any,
 ) -> Entry:
-    """A sound entry made of ``base``, scored on two views of each object of ``errors``, off by so many mm everywhere on
-    the object and by nothing behind it. ``about`` goes into its description."""
+    """A sound entry made of ``base``, scored on two views of each object of ``errors``, off by so
+    many mm everywhere on the object and by nothing behind it. ``about`` goes into its
+    description."""
     first = base.row.per_object[0]
-    inside, outside = (getattr(first, f"{kind}_pixels") // first.samples for kind in ("object", "background"))
+    inside, outside = (
+        getattr(first, f"{kind}_pixels") // first.samples for kind in ("object", "background")
+    )
     per_object = []
     for name_of_object, error in errors.items():
         whole = combine(ErrorStats(inside, error, error), ErrorStats(outside, 0.0, 0.0))
@@ -126,7 +152,9 @@ def entry_with_errors(
             )
         )
     intervals = {key: list(interval_over(per_object, key) or (None, None)) for key in RANKED}
-    data = {"samples": 2 * len(errors), "benchmark": None} | ({"content": dict(content)} if content else {})
+    data = {"samples": 2 * len(errors), "benchmark": None} | (
+        {"content": dict(content)} if content else {}
+    )
     frames = len(about.get("frames_used", base.row.submission.frames_used))
     changes = {
         "submission": base.row.submission.model_copy(update={"name": name, **about}),
@@ -151,24 +179,36 @@ def changed(entry: Entry, **changes: Any) -> Entry:
 
 
 def flat_scores(per_object: Sequence[ObjectMeans], pixels: int = 0) -> dict[str, float | None]:
-    """Scores of errors that are the same all over each object, of 100 mm depth; ``pixels`` of an image, 0 where no
-    pixel is void."""
-    keys = [key for key in Metrics.model_fields if key.startswith("object_") and key.endswith("_mm")]
+    """Scores of errors that are the same all over each object, of 100 mm depth; ``pixels`` of an
+    image, 0 where no pixel is void."""
+    keys = [
+        key for key in Metrics.model_fields if key.startswith("object_") and key.endswith("_mm")
+    ]
     means = {key: mean_over(per_object, key) for key in RANKED}
     mae, samples = means["object_mae_mm"] or 0.0, sum(part.samples for part in per_object)
     within = {
-        f"object_within_{limit}mm_share": sum(p.samples for p in per_object if (p.object_mae_mm or 0.0) <= limit)
+        f"object_within_{limit}mm_share": sum(
+            p.samples for p in per_object if (p.object_mae_mm or 0.0) <= limit
+        )
         / samples
         for limit in WITHIN_MM
     }
     void = sum(part.void_pixels for part in per_object) / (samples * pixels) if pixels else 0.0
     means |= {"two_sided_with_void_mae_mm": mae, "invented_share": 0.0}
-    return dict.fromkeys(keys, mae) | means | within | {"void_share": void, "object_mae_range_share": mae / 100}
+    return (
+        dict.fromkeys(keys, mae)
+        | means
+        | within
+        | {"void_share": void, "object_mae_range_share": mae / 100}
+    )
 
 
 def reliance(**changes: Any) -> Reliance:
     """A phase reliance of 0.625."""
-    parts = dict.fromkeys(RelianceParts.model_fields) | {"follows_phase": 0.75, "change_outline": 2.5}
+    parts = dict.fromkeys(RelianceParts.model_fields) | {
+        "follows_phase": 0.75,
+        "change_outline": 2.5,
+    }
     content = {
         "version": RELIANCE_VERSION,
         "score": 0.625,
@@ -203,9 +243,12 @@ def robustness() -> RowRobustness:
     )
 
 
-def named_benchmarks(monkeypatch: Any, counts: Mapping[str, Any] | None = None, **contents: Mapping[str, str]) -> None:
-    """Have ``full``, ``unseen`` and so on be the benchmarks of these contents, the first with ``counts`` of its objects
-    in the test split against depth; of the others nothing else is known."""
+def named_benchmarks(
+    monkeypatch: Any, counts: Mapping[str, Any] | None = None, **contents: Mapping[str, str]
+) -> None:
+    """Have ``full``, ``unseen`` and so on be the benchmarks of these contents, the first with
+    ``counts`` of its objects in the test split against depth; of the others nothing else is
+    known."""
     named = []
     for name, content in contents.items():
         named.append(Benchmark(f"fpp-bench-{name}", 2, name, 960))

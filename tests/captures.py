@@ -13,7 +13,8 @@ from fpp_ml_bench.optics.sequence import Sequence
 
 
 def capture(rig, depth_m, noise=1.0, seed=0, albedo=0.45, ambient=4.0):
-    """Frames of a surface at ``depth_m`` (H, W): pattern lookup by OpenCV, light, noise and 8 bits."""
+    """Frames of a surface at ``depth_m`` (H, W): pattern lookup by OpenCV, light, noise and 8
+    bits."""
     x, y = rig.camera.rays()
     u, v = (
         coordinates.astype(np.float32)
@@ -43,4 +44,6 @@ TURNED = Rig(
     pitch_vertical_px=20.0,
     sequence=Sequence(9, 8, 7),
 )
-LENSES = replace(TURNED, projector=replace(TURNED.projector, distortion=(0.05, -0.03, 0.001, -0.001, 0.0)))
+LENSES = replace(
+    TURNED, projector=replace(TURNED.projector, distortion=(0.05, -0.03, 0.001, -0.001, 0.0))
+)

@@ -1,4 +1,5 @@
-"""Headless Chromium over its DevTools pipe, with nothing but the standard library: open a page, press keys, look."""
+"""Headless Chromium over its DevTools pipe, with nothing but the standard library: open a page,
+press keys, look."""
 
 import base64
 import fcntl
@@ -43,14 +44,18 @@ def chromium() -> str:
 
 
 class Browser:
-    """One browser with one page. Console messages, exceptions and requests are collected as they come."""
+    """One browser with one page. Console messages, exceptions and requests are collected as they
+    come."""
 
     def __init__(self) -> None:
         path = chromium()
-        self._home = tempfile.TemporaryDirectory(prefix="fpp-bench-chromium-", ignore_cleanup_errors=True)
+        self._home = tempfile.TemporaryDirectory(
+            prefix="fpp-bench-chromium-", ignore_cleanup_errors=True
+        )
         browser_in, self._out = os.pipe()
         self._in, browser_out = os.pipe()
-        # The browser reads commands from 3 and answers on 4; ours are moved out of the way of those numbers first.
+        # The browser reads commands from 3 and answers on 4; ours are moved out of the way of those
+        # numbers first.
         read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 100) for fd in (browser_in, browser_out))
 
         def place() -> None:
@@ -73,7 +78,9 @@ class Browser:
         self.events: list[dict[str, Any]] = []
         targets = self.call("Target.getTargets")["targetInfos"]
         target = next(info["targetId"] for info in targets if info["type"] == "page")
-        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.call("Page.setLifecycleEventsEnabled", enabled=True)
@@ -113,10 +120,18 @@ class Browser:
         ):
             self.events.append(self._next())
 
-    def open(self, page: Path | str, width: int = 1280, height: int = 900, dark: bool = False) -> None:
+    def open(
+        self, page: Path | str, width: int = 1280, height: int = 900, dark: bool = False
+    ) -> None:
         """Load a file or an address in a window of that size and wait until it is there."""
         phone = width < 600
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=phone,
+        )
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.call("Emulation.setEmulatedMedia", features=scheme)
         self._go("about:blank")  # or a change of the fragment alone would load nothing
@@ -125,14 +140,20 @@ class Browser:
 
     def run(self, script: str) -> Any:
         """Value of a JavaScript expression on the page; an exception in it fails the test."""
-        answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        answer = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def click(self, selector: str) -> None:
-        """Move to the middle of the first element that matches, and press the mouse there, as a person does."""
+        """Move to the middle of the first element that matches, and press the mouse there, as a
+        person does."""
         element = f"document.querySelector({json.dumps(selector)})"
-        box = self.run(f"{element}.scrollIntoView({{block: 'center'}}), {element}.getBoundingClientRect().toJSON()")
+        box = self.run(
+            f"{element}.scrollIntoView({{block: 'center'}}), "
+            f"{element}.getBoundingClientRect().toJSON()"
+        )
         place = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
         self.call("Input.dispatchMouseEvent", type="mouseMoved", **place)
         for kind in ("mousePressed", "mouseReleased"):
@@ -143,13 +164,21 @@ class Browser:
         code = {"Tab": 9, "Enter": 13, " ": 32}.get(name, 0)
         for kind in ("keyDown", "keyUp"):
             extra = {"text": text} if text and kind == "keyDown" else {}
-            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code, **extra)
+            self.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=name,
+                code=name,
+                windowsVirtualKeyCode=code,
+                **extra,
+            )
 
     def type(self, text: str) -> None:
         self.call("Input.insertText", text=text)
 
     def complaints(self) -> list[str]:
-        """What the console, the page's code or its policy complained about since the page was opened."""
+        """What the console, the page's code or its policy complained about since the page was
+        opened."""
         self.run("1")  # everything before this has come by now
         complaints = []
         for event in self.events:
@@ -176,7 +205,9 @@ class Browser:
         if whole:
             size = self.call("Page.getLayoutMetrics")["cssContentSize"]
             clip = {**size, "scale": 1}
-            answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
+            answer = self.call(
+                "Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip
+            )
         path.write_bytes(base64.b64decode(answer["data"]))
         return path
 

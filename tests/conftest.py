@@ -24,7 +24,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 TINY_SIZE = 176
 """The smallest size at pitch 18 is about 170 px."""
 TINY_OBJECTS = ("bowl", "cork", "mug", "power_drill")
-"""Two objects of the training split, so that a shard holds two, and one object of each other split."""
+"""Two objects of the training split, so that a shard holds two, and one object of each other
+split."""
 TINY_CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
 """Configurations of the paper's sequence: all but crossed."""
 
@@ -40,12 +41,15 @@ def tiny_settings(**changes):
 def file_bytes(folder):
     """Content of all files below a folder, by relative path."""
     folder = Path(folder)
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
 
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
-    """Folder of the tiny dataset, all 52 frames. Shared by all tests: copy it before changing it."""
+    """Folder of the tiny dataset, all 52 frames. Shared by all tests: copy it before changing
+    it."""
     from fpp_ml_bench.loaders.render.builder import build
 
     folder = tmp_path_factory.mktemp("tiny") / "dataset"
@@ -63,7 +67,8 @@ def opened(tiny):
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory):
-    """Eight samples of disks, with exact depth: what is scored. Shared by all tests: copy it before changing it."""
+    """Eight samples of disks, with exact depth: what is scored. Shared by all tests: copy it before
+    changing it."""
     from scored_dataset import make_dataset
 
     return make_dataset(tmp_path_factory.mktemp("scored") / "tiny")
@@ -84,7 +89,9 @@ def base(tmp_path_factory, dataset):
 
     from fpp_ml_bench.leaderboard.rows import read_entry
 
-    return read_entry(write_result_file(tmp_path_factory.mktemp("base") / "base.json", dataset, 1.0))
+    return read_entry(
+        write_result_file(tmp_path_factory.mktemp("base") / "base.json", dataset, 1.0)
+    )
 
 
 @pytest.fixture

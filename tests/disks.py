@@ -8,7 +8,8 @@ import pytest
 
 @contextmanager
 def small_disk(folder, size):
-    """Mount a file system of ``size`` on a new ``folder``; skips the test where that needs privileges."""
+    """Mount a file system of ``size`` on a new ``folder``; skips the test where that needs
+    privileges."""
     folder.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
     try:

@@ -1,5 +1,5 @@
-"""How far pixels are from depth edges: what narrow bands are compared with, and where tests find pixels inside an
-object."""
+"""How far pixels are from depth edges: what narrow bands are compared with, and where tests find
+pixels inside an object."""
 
 import cv2
 import numpy as np
@@ -8,8 +8,8 @@ from fpp_ml_bench.depth import depth_edges
 
 
 def edge_distance_px(depth_mm, jump_mm=None):
-    """Distance of each pixel to the nearest of `depth_edges`, float32 (H, W), in px; 0 for both pixels beside an
-    edge, inf in an image without edges."""
+    """Distance of each pixel to the nearest of `depth_edges`, float32 (H, W), in px; 0 for both
+    pixels beside an edge, inf in an image without edges."""
     edge = depth_edges(depth_mm, jump_mm)
     if not edge.any():
         return np.full(depth_mm.shape, np.inf, dtype=np.float32)

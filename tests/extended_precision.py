@@ -1,5 +1,5 @@
-"""Every score of the protocol, written anew from PROTOCOL.md in extended precision by sorting and masking. No code is
-that of the package."""
+"""Every score of the protocol, written anew from PROTOCOL.md in extended precision by sorting and
+masking. No code is that of the package."""
 
 from fractions import Fraction
 
@@ -18,7 +18,9 @@ def edges_of(target):
     for axis, length in enumerate(target.shape):
         for place in range(length - 1):
             first, second = (np.take(target, place + step, axis) for step in (0, 1))
-            crossed = ((first > 0) != (second > 0)) | ((first > 0) & (second > 0) & (np.abs(second - first) > jump))
+            crossed = ((first > 0) != (second > 0)) | (
+                (first > 0) & (second > 0) & (np.abs(second - first) > jump)
+            )
             for step in (0, 1):
                 index = [slice(None)] * 2
                 index[axis] = place + step
@@ -30,7 +32,9 @@ def sample_scores(prediction, target, band, void, unlit, charge=None):
     """All scores in float128 by sorting and masking; None for an empty set."""
     error = prediction.astype(LONG) - target.astype(LONG)
     inside, outside, edges = (target > 0) & ~void, (target == 0) & ~void, edges_of(target)
-    distance = ndimage.distance_transform_edt(~edges) if edges.any() else np.full(target.shape, np.inf)
+    distance = (
+        ndimage.distance_transform_edt(~edges) if edges.any() else np.full(target.shape, np.inf)
+    )
     valid = inside & (prediction > 0)
 
     def mae(pixels):
@@ -76,11 +80,17 @@ def sample_scores(prediction, target, band, void, unlit, charge=None):
     dark = unlit > 0
     far = np.abs(prediction.astype(LONG) - unlit.astype(LONG))
     lit = dark & (prediction > 0)
-    if inside.any() and (span := target[inside].astype(LONG).max() - target[inside].astype(LONG).min()) > 0:
+    if (
+        inside.any()
+        and (span := target[inside].astype(LONG).max() - target[inside].astype(LONG).min()) > 0
+    ):
         scores["object_mae_range_share"] = mae(inside) / span
     scores["void_share"] = LONG(np.count_nonzero(void)) / void.size
     if dark.any():
-        scores |= {"unlit_mae_mm": far[dark].mean(), "unlit_rmse_mm": np.sqrt((far[dark] ** 2).mean())}
+        scores |= {
+            "unlit_mae_mm": far[dark].mean(),
+            "unlit_rmse_mm": np.sqrt((far[dark] ** 2).mean()),
+        }
         scores["unlit_missing_share"] = share(dark & ~lit, dark)
     if lit.any():
         scores["unlit_valid_mae_mm"] = far[lit].mean()
@@ -97,8 +107,12 @@ def sample_scores(prediction, target, band, void, unlit, charge=None):
     scores["object_p95_mm"] = quantile(ordered, LONG(95) / 100) if some else None
     scores["object_max_mm"] = ordered[-1] if some else None
     for limit in (1, 2, 5, 10):
-        scores[f"object_within_{limit}mm_share"] = share(ordered <= limit, np.ones(ordered.size, bool))
-    scores["object_shift_free_mae_mm"] = np.abs(signed - quantile(signed, LONG(1) / 2)).mean() if some else None
+        scores[f"object_within_{limit}mm_share"] = share(
+            ordered <= limit, np.ones(ordered.size, bool)
+        )
+    scores["object_shift_free_mae_mm"] = (
+        np.abs(signed - quantile(signed, LONG(1) / 2)).mean() if some else None
+    )
     return scores
 
 
@@ -107,8 +121,8 @@ def gaussian_quantile(coverage):
 
 
 def left_out(values, order, share, pixels):
-    """Sum of ``values`` once ``share`` of ``pixels`` is left out, largest ``order`` first, equals in equal parts, over
-    the other pixels."""
+    """Sum of ``values`` once ``share`` of ``pixels`` is left out, largest ``order`` first, equals
+    in equal parts, over the other pixels."""
     weights, budget = np.zeros(values.size, LONG), share * pixels
     for key in sorted(set(order), reverse=True):
         group = order == key
@@ -133,7 +147,10 @@ def sigma_scores(prediction, target, sigma, void, charge=None):
         invented = sigma[(target == 0) & ~void & (prediction > 0)].astype(LONG)
         cost = np.append(np.where(depth > 0, error, LONG(charge)), [LONG(charge)] * invented.size)
         unsure = np.append(unsure, np.where(invented > 0, invented, np.inf))
-    for name, values, finish in (("mae_mm", cost, lambda mean: mean), ("rmse_mm", cost**2, np.sqrt)):
+    for name, values, finish in (
+        ("mae_mm", cost, lambda mean: mean),
+        ("rmse_mm", cost**2, np.sqrt),
+    ):
         gaps = []
         for step in range(20):
             share = Fraction(step, 20)
@@ -152,5 +169,7 @@ def sigma_scores(prediction, target, sigma, void, charge=None):
     scores["sigma_median_mm"] = (ordered[(error.size - 1) // 2] + ordered[error.size // 2]) / 2
     floored = np.maximum(spread, LONG("0.01"))
     ratio = np.minimum(error / floored, LONG(10))
-    scores["nll"] = (np.log(floored) + np.log(2 * LONG("3.14159265358979323846")) / 2 + ratio**2 / 2).mean()
+    scores["nll"] = (
+        np.log(floored) + np.log(2 * LONG("3.14159265358979323846")) / 2 + ratio**2 / 2
+    ).mean()
     return scores

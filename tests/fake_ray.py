@@ -1,5 +1,6 @@
-"""A stand-in for Ray with the part of its interface that the package uses: tasks run in this process, when their result
-is asked for, on what pickling leaves of their arguments. ``dies`` names the task whose node dies for good."""
+"""A stand-in for Ray with the part of its interface that the package uses: tasks run in this
+process, when their result is asked for, on what pickling leaves of their arguments. ``dies`` names
+the task whose node dies for good."""
 
 import pickle
 import socket

@@ -1,5 +1,5 @@
-"""Scenes of the phase routes' tests: an object, and a fringe on a plane that fills the frame, from the benchmark's own
-light and sensor: what its builder can't place."""
+"""Scenes of the phase routes' tests: an object, and a fringe on a plane that fills the frame, from
+the benchmark's own light and sensor: what its builder can't place."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,10 +28,14 @@ OTHER_RIG = replace(
 FIRST = {"horizontal": 0, "vertical": 18}
 """The first fringe of each direction."""
 PAPER = named_light("paper")
-DIRECT = PAPER.changed("bounces", interreflection=False, ambient_occlusion=False).changed("camera", rays_across=1)
-"""Light of one bounce, on the central ray of each pixel: closed forms of noise and modulation hold in it."""
+DIRECT = PAPER.changed("bounces", interreflection=False, ambient_occlusion=False).changed(
+    "camera", rays_across=1
+)
+"""Light of one bounce, on the central ray of each pixel: closed forms of noise and modulation hold
+in it."""
 USERS_WORD = {"white_grey": PAPER.camera.reference_grey, "ambient_grey": PAPER.ambient_grey}
-"""Photometric calibration of a plane that fills the frame: no background is left to calibrate its brightness."""
+"""Photometric calibration of a plane that fills the frame: no background is left to calibrate its
+brightness."""
 
 
 @cache
@@ -42,7 +46,9 @@ def photograph(name: str, view: str, rig: Rig = RIG, light: Light = PAPER):
     return replace(row, frames={index: frame.copy() for index, frame in row.frames.items()})
 
 
-def plane_depth_m(rig: Rig, distance_m: float, tilt: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+def plane_depth_m(
+    rig: Rig, distance_m: float, tilt: tuple[float, float] = (0.0, 0.0)
+) -> NDArray[np.float64]:
     """Depth (H, W) in m of the plane Z = distance + tilt_x X + tilt_y Y."""
     x, y = rig.camera.rays()
     return distance_m / (1 - tilt[0] * x - tilt[1] * y)

@@ -1,8 +1,10 @@
-"""A Hugging Face Hub on the loopback interface, standard library only: enough of it for the real client.
+"""A Hugging Face Hub on the loopback interface, standard library only: enough of it for the real
+client.
 
-Repositories live in memory. Whose name they carry decides what goes wrong: ``forbidden/...`` may not be written (403),
-``broken/...`` fails with 500, ``cut/...`` fails once, at its first commit, to ``raced/...`` somebody else commits
-while files are sent, and files of ``gated/...`` may not be read (403). The only tokens are `TOKENS`.
+Repositories live in memory. Whose name they carry decides what goes wrong: ``forbidden/...`` may
+not be written (403), ``broken/...`` fails with 500, ``cut/...`` fails once, at its first commit, to
+``raced/...`` somebody else commits while files are sent, and files of ``gated/...`` may not be read
+(403). The only tokens are `TOKENS`.
 """
 
 import base64
@@ -18,7 +20,9 @@ from urllib.parse import unquote, urlsplit
 TOKENS = {"hf_good": "alice"}
 ORGANISATIONS = ("forbidden", "broken", "cut", "raced")
 LARGE_SUFFIXES = (".parquet", ".ply", ".png")
-_API = re.compile(r"/api/(datasets|spaces|models)/([^/]+/[^/]+)(?:/(preupload|commit|revision|tree)/([^/]+)(/.*)?)?")
+_API = re.compile(
+    r"/api/(datasets|spaces|models)/([^/]+/[^/]+)(?:/(preupload|commit|revision|tree)/([^/]+)(/.*)?)?"
+)
 _RESOLVE = re.compile(r"/(?:(datasets|spaces)/)?([^/]+/[^/]+)/resolve/([^/]+)/(.+)")
 _LFS = re.compile(r"/(?:(datasets|spaces)/)?([^/]+/[^/]+)\.git/info/lfs/objects/batch")
 
@@ -31,7 +35,9 @@ def git_sha1(content: bytes) -> str:
 class Repo:
     private: bool = False
     sdk: str | None = None
-    files: dict[str, bytes] = field(default_factory=lambda: {".gitattributes": b"*.parquet filter=lfs\n"})
+    files: dict[str, bytes] = field(
+        default_factory=lambda: {".gitattributes": b"*.parquet filter=lfs\n"}
+    )
     commits: list[str] = field(default_factory=lambda: [hashlib.sha1(b"initial").hexdigest()])
     tags: dict[str, tuple[str, dict[str, bytes]]] = field(default_factory=dict)
     """Commit and files of each tag; ``files`` are those of the main branch."""
@@ -67,7 +73,11 @@ class HubServer(ThreadingHTTPServer):
     def writes(self) -> list[tuple[str, str]]:
         """Requests that change something, and forget them all."""
         requests, self.requests = self.requests, []
-        return [(m, p) for m, p in requests if m == "PUT" or p.endswith("/repos/create") or "/commit/" in p]
+        return [
+            (m, p)
+            for m, p in requests
+            if m == "PUT" or p.endswith("/repos/create") or "/commit/" in p
+        ]
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -88,7 +98,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def _refuse(self, status: int, message: str, code: str = "") -> None:
-        self._answer(status, {"error": message}, X_Error_Message=message, **({"X_Error_Code": code} if code else {}))
+        self._answer(
+            status,
+            {"error": message},
+            X_Error_Message=message,
+            **({"X_Error_Code": code} if code else {}),
+        )
 
     def _handle(self) -> None:
         path = unquote(urlsplit(self.path).path)
@@ -177,13 +192,28 @@ class _Handler(BaseHTTPRequestHandler):
         if action == "tree":
             return self._answer(200, [self._entry(path, files[path]) for path in sorted(files)])
         siblings = [{"rfilename": path} for path in sorted(files)]
-        about = {"id": name, "sha": commit, "private": repo.private, "siblings": siblings, "tags": []}
+        about = {
+            "id": name,
+            "sha": commit,
+            "private": repo.private,
+            "siblings": siblings,
+            "tags": [],
+        }
         return self._answer(200, about)
 
     def _entry(self, path: str, content: bytes) -> dict[str, Any]:
-        entry: dict[str, Any] = {"type": "file", "path": path, "size": len(content), "oid": git_sha1(content)}
+        entry: dict[str, Any] = {
+            "type": "file",
+            "path": path,
+            "size": len(content),
+            "oid": git_sha1(content),
+        }
         if path.endswith(LARGE_SUFFIXES):
-            entry["lfs"] = {"oid": hashlib.sha256(content).hexdigest(), "size": len(content), "pointerSize": 130}
+            entry["lfs"] = {
+                "oid": hashlib.sha256(content).hexdigest(),
+                "size": len(content),
+                "pointerSize": 130,
+            }
             entry["oid"] = git_sha1(b"pointer")
         return entry
 
@@ -206,7 +236,10 @@ class _Handler(BaseHTTPRequestHandler):
                 del repo.files[value["path"]]
         repo.commits.append(hashlib.sha1(body).hexdigest())
         url = f"{self.server.endpoint}/{kind}/{name}/commit/{repo.commits[-1]}"
-        return self._answer(200, {"success": True, "commitOid": repo.commits[-1], "commitUrl": url, "hookOutput": ""})
+        return self._answer(
+            200,
+            {"success": True, "commitOid": repo.commits[-1], "commitUrl": url, "hookOutput": ""},
+        )
 
     def _resolve(self, repo: Repo, name: str, revision: str, path: str) -> None:
         if name.startswith("gated/"):
@@ -221,11 +254,16 @@ class _Handler(BaseHTTPRequestHandler):
         etag = self._entry(path, content).get("lfs", {}).get("oid") or git_sha1(content)
         about = {"ETag": f'"{etag}"', "X_Repo_Commit": commit, "Accept_Ranges": "bytes"}
         if byte_range := re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range") or ""):
-            first, last = int(byte_range[1]), min(int(byte_range[2] or len(content)), len(content) - 1)
+            first, last = (
+                int(byte_range[1]),
+                min(int(byte_range[2] or len(content)), len(content) - 1),
+            )
             about["Content_Range"] = f"bytes {first}-{last}/{len(content)}"
             return self._answer(206, content[first : last + 1], **about)
         if self.command == "GET" and path in self.server.halves:
             self.server.halves.remove(path)
             self.close_connection = True
-            return self._answer(200, content[: len(content) // 2], **about, Content_Length=str(len(content)))
+            return self._answer(
+                200, content[: len(content) // 2], **about, Content_Length=str(len(content))
+            )
         return self._answer(200, content, **about)

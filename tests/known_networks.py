@@ -9,7 +9,8 @@ from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 
 
 class Oracle(nn.Module):
-    """A network that knows the truth of the samples it is shown: its layer ``out`` holds the maps it was given."""
+    """A network that knows the truth of the samples it is shown: its layer ``out`` holds the maps
+    it was given."""
 
     def __init__(self, maps: dict[float, torch.Tensor]) -> None:
         super().__init__()
@@ -45,5 +46,7 @@ def oracle(opened, fields):
     for sample in opened.samples("all"):
         ground_truth = truth(opened.depth_mm(sample), opened.rig, "horizontal")
         key = subject_with(nn.Identity(), opened.size).input_batch([[opened.frame(sample, 0)]])[0]
-        maps[float(key.double().sum())] = torch.from_numpy(np.stack([ground_truth[name] for name in fields]))
+        maps[float(key.double().sum())] = torch.from_numpy(
+            np.stack([ground_truth[name] for name in fields])
+        )
     return subject_with(Oracle(maps), opened.size)

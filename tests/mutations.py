@@ -1,5 +1,5 @@
-"""Valid files of every kind that comes from outside, and mutations of them: each must read, or end in an FppBenchError
-that names the file."""
+"""Valid files of every kind that comes from outside, and mutations of them: each must read, or end
+in an FppBenchError that names the file."""
 
 import json
 import math
@@ -127,13 +127,19 @@ SEQUENCES: dict[str, dict[str, Any]] = {
         },
     },
 }
-RECIPE = {"extends": "base", "network": "unet", "normalisation": "raw", "batch": 4, "loss": {"name": "rmse"}}
+RECIPE = {
+    "extends": "base",
+    "network": "unet",
+    "normalisation": "raw",
+    "batch": 4,
+    "loss": {"name": "rmse"},
+}
 
 
 @dataclass(frozen=True)
 class Source:
-    """A valid file, ``content`` its plain values, and what ``read`` does with it; ``sealed`` makes a mutation's hash
-    right again, as who mutates it on purpose would."""
+    """A valid file, ``content`` its plain values, and what ``read`` does with it; ``sealed`` makes
+    a mutation's hash right again, as who mutates it on purpose would."""
 
     file: Path
     content: Any
@@ -160,12 +166,21 @@ class Source:
 
 
 def outcome(read: Callable[[], object], file: Path) -> str:
-    """``read``, ``refused`` with an FppBenchError that names ``file`` or its folder, or what else was raised."""
+    """``read``, ``refused`` with an FppBenchError that names ``file`` or its folder, or what else
+    was raised."""
     try:
-        with redirect_stdout(StringIO()), redirect_stderr(StringIO()), catch_warnings(action="error"):
+        with (
+            redirect_stdout(StringIO()),
+            redirect_stderr(StringIO()),
+            catch_warnings(action="error"),
+        ):
             read()
     except FppBenchError as error:
-        return "refused" if file.name in str(error) or str(file.parent) in str(error) else f"unnamed: {error}"
+        return (
+            "refused"
+            if file.name in str(error) or str(file.parent) in str(error)
+            else f"unnamed: {error}"
+        )
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return "read"
@@ -200,12 +215,16 @@ def _changed(content: Any, chance: random.Random) -> Any:
         if kind == 0:
             del holder[key]
         elif kind == 1 and isinstance(holder, dict):
-            holder[str(chance.choice(("", "x", "__class__", "é", "../x", "\x1b", key * 2)))] = holder.pop(key)
+            holder[str(chance.choice(("", "x", "__class__", "é", "../x", "\x1b", key * 2)))] = (
+                holder.pop(key)
+            )
         elif kind == 2:
             other, theirs = chance.choice(places)
             holder[key] = deepcopy(other[theirs])
         elif kind == 3 and isinstance(holder[key], int | float):
-            holder[key] = chance.choice((-holder[key], holder[key] * 1000, holder[key] // 7, str(holder[key])))
+            holder[key] = chance.choice(
+                (-holder[key], holder[key] * 1000, holder[key] // 7, str(holder[key]))
+            )
         elif kind == 4 and isinstance(holder, list):
             holder.extend(deepcopy(holder[:50]))
         else:
@@ -214,7 +233,9 @@ def _changed(content: Any, chance: random.Random) -> Any:
 
 
 def _places(value: Any) -> Iterator[tuple[Any, Any]]:
-    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+    for key in (
+        value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    ):
         yield value, key
         yield from _places(value[key])
 
@@ -223,12 +244,20 @@ def sealed_manifest(content: Any) -> Any:
     """The manifest's content with the fingerprint that it then has."""
     if not isinstance(content, dict):
         return content
-    counted = {key: value for key, value in content.items() if key not in ("others", "generator", "fingerprint")}
-    return {**content, "fingerprint": sha256(json.dumps(counted, sort_keys=True).encode()).hexdigest()}
+    counted = {
+        key: value
+        for key, value in content.items()
+        if key not in ("others", "generator", "fingerprint")
+    }
+    return {
+        **content,
+        "fingerprint": sha256(json.dumps(counted, sort_keys=True).encode()).hexdigest(),
+    }
 
 
 def _verified(folder: Path) -> None:
-    """What commands do with a dataset: open, describe and verify it. Findings are what `verify` is for."""
+    """What commands do with a dataset: open, describe and verify it. Findings are what `verify` is
+    for."""
     verify(folder)
     opened = DatasetFolder(folder)
     main(["info", str(folder)])
@@ -240,14 +269,22 @@ def sources(folder: Path) -> dict[str, Source]:
     """A source for each reader, with all that it needs, in new folders below ``folder``."""
     made: dict[str, Source] = {}
 
-    def add(name: str, file: str, content: Any, read: Callable[[Path], object], **more: Any) -> None:
+    def add(
+        name: str, file: str, content: Any, read: Callable[[Path], object], **more: Any
+    ) -> None:
         path = folder / name.replace(" ", "-") / file
         path.parent.mkdir(parents=True, exist_ok=True)
         made[name] = Source(path, content, lambda: read(path), **more)
 
     dataset = make(folder / "manifest")
     manifest = json.loads((dataset / "manifest.json").read_text())
-    add("manifest", "manifest.json", manifest, lambda path: _verified(path.parent), sealed=sealed_manifest)
+    add(
+        "manifest",
+        "manifest.json",
+        manifest,
+        lambda path: _verified(path.parent),
+        sealed=sealed_manifest,
+    )
     rig = paper_rig().to_dict()
     add("rig", "rig.yaml", rig, load_rig)
     add("rig as JSON", "rig.json", rig, load_rig)
@@ -257,7 +294,13 @@ def sources(folder: Path) -> dict[str, Source]:
     add("projection", "rig.yaml", rig, load_projection)
     meshes = [
         {"name": "part", "path": "part.stl", "scale": 0.001, "rotation_deg": [90, 0, 0.5]},
-        {"name": "other", "path": "part.stl", "offset_m": [0, 0, 0.1], "centre": False, "split": "train"},
+        {
+            "name": "other",
+            "path": "part.stl",
+            "offset_m": [0, 0, 0.1],
+            "centre": False,
+            "split": "train",
+        },
     ]
     add("mesh list", "list.yaml", meshes, read_mesh_list)
     trimesh.creation.box((1.0, 1.0, 1.0)).export(folder / "mesh-list" / "part.stl")
@@ -282,8 +325,8 @@ ODD_STEMS = ("x" * 120, "a b", "é", "<b>", "..x", "-", "a\\b", "x\x1b[31m")
 
 
 def tree_outcome(tree: Path, work: Path, seed: int) -> str:
-    """`outcome` of importing a copy of the published ``tree`` of which a file was changed, renamed, moved or removed,
-    all in the folder ``work``, which must be new."""
+    """`outcome` of importing a copy of the published ``tree`` of which a file was changed, renamed,
+    moved or removed, all in the folder ``work``, which must be new."""
     chance = random.Random(f"tree {seed}")
     copy = shutil.copytree(tree, work / "tree")
     files = sorted(path for path in copy.rglob("*") if path.is_file())

@@ -1,4 +1,5 @@
-"""Small published trees on disk: PNG by OpenCV, .mat by SciPy and h5py, none by this package's writers."""
+"""Small published trees on disk: PNG by OpenCV, .mat by SciPy and h5py, none by this package's
+writers."""
 
 import io
 import zlib
@@ -55,7 +56,11 @@ def write_png(path, image):
 
 def write_mat(path, compressed=True, **values):
     path.parent.mkdir(parents=True, exist_ok=True)
-    scipy.io.savemat(path, {name: np.atleast_2d(value) for name, value in values.items()}, do_compression=compressed)
+    scipy.io.savemat(
+        path,
+        {name: np.atleast_2d(value) for name, value in values.items()},
+        do_compression=compressed,
+    )
 
 
 def v73_bytes(**values):
@@ -63,15 +68,20 @@ def v73_bytes(**values):
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", userblock_size=512) as file:
         for name, value in values.items():
-            file.create_dataset(name, data=np.atleast_2d(value).T).attrs["MATLAB_class"] = np.bytes_("single")
-    header = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Mon Nov  2 2026 HDF5 schema 1.00 ."
+            file.create_dataset(name, data=np.atleast_2d(value).T).attrs["MATLAB_class"] = (
+                np.bytes_("single")
+            )
+    header = (
+        b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Mon Nov  2 2026 HDF5 schema 1.00 ."
+    )
     content = bytearray(buffer.getvalue())
     content[:128] = header.ljust(124) + b"\x00\x02IM"
     return bytes(content)
 
 
 def make_tree(root, variants=("raw",), info=None, splits=SPLITS, size=SIZE):
-    """A valid training tree; ``info`` (depth ranges) is written by default if a variant needs it."""
+    """A valid training tree; ``info`` (depth ranges) is written by default if a variant needs
+    it."""
     for split, objects in splits.items():
         for stem in (f"{name}_{view}" for name in objects for view in VIEWS):
             depth = depth_of(stem, size)
@@ -80,7 +90,11 @@ def make_tree(root, variants=("raw",), info=None, splits=SPLITS, size=SIZE):
             values = {
                 "raw": {"depthMap": depth},
                 "global": {"depthMapMeters": depth / np.float32(1000)},
-                "individual": {"depthMapNormalized": np.where(inside, (depth.astype(float) - low) / (high - low), 0)},
+                "individual": {
+                    "depthMapNormalized": np.where(
+                        inside, (depth.astype(float) - low) / (high - low), 0
+                    )
+                },
             }
             for variant in variants:
                 folder = root / TRAINING / FOLDERS[variant] / split
@@ -88,21 +102,27 @@ def make_tree(root, variants=("raw",), info=None, splits=SPLITS, size=SIZE):
                 write_mat(folder / "depth" / f"{stem}.mat", **values[variant])
             if info or (info is None and "individual" in variants):
                 write_mat(
-                    root / TRAINING / f"info_depth_params/{split}/depth/{stem}.mat", depth_min=low, depth_max=high
+                    root / TRAINING / f"info_depth_params/{split}/depth/{stem}.mat",
+                    depth_min=low,
+                    depth_max=high,
                 )
     return root
 
 
 def files_of(tree):
     """What a Hub repository with the tree holds: content by path."""
-    files = {path.relative_to(tree).as_posix(): path.read_bytes() for path in tree.rglob("*") if path.is_file()}
+    files = {
+        path.relative_to(tree).as_posix(): path.read_bytes()
+        for path in tree.rglob("*")
+        if path.is_file()
+    }
     return {**files, "README.md": b"# A dataset\n", ".gitattributes": b""}
 
 
 @contextmanager
 def hub_of(tree, cache, monkeypatch):
-    """A Hub on the loopback interface whose one dataset is the tree, as `PUBLISHED`; this process's client talks to
-    it. The Hugging Face cache is the folder ``cache``."""
+    """A Hub on the loopback interface whose one dataset is the tree, as `PUBLISHED`; this process's
+    client talks to it. The Hugging Face cache is the folder ``cache``."""
     server = HubServer()
     server.repos["datasets", PUBLISHED] = Repo(files=files_of(tree))
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)

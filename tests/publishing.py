@@ -1,4 +1,5 @@
-"""What the tests of publishing share: a dataset of random frames, and ``fpp-bench publish`` towards one server."""
+"""What the tests of publishing share: a dataset of random frames, and ``fpp-bench publish`` towards
+one server."""
 
 import json
 import os
@@ -31,7 +32,8 @@ DATA = [f"data/{split}-00000-of-00001.parquet" for split in OBJECTS]
 
 
 def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFolder:
-    """All 52 frames of random pixels: what no codec may change. One object may have a name that is markup."""
+    """All 52 frames of random pixels: what no codec may change. One object may have a name that is
+    markup."""
     (folder / "meshes").mkdir(parents=True)
     manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), SIZE, "all", exact=True)
     plans, receipts = [], []
@@ -42,10 +44,16 @@ def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFo
         for plan in plan_shards(split, views):
             rows = []
             for sample, name, view in plan.samples:
-                frames = dict(enumerate(rng.integers(0, 256, (len(PAPER_SEQUENCE), *SIZE), dtype=np.uint8)))
-                depth = np.nextafter(disk_depth(SIZE, len(rows)), np.float32(5000)).astype(np.float32)
+                frames = dict(
+                    enumerate(rng.integers(0, 256, (len(PAPER_SEQUENCE), *SIZE), dtype=np.uint8))
+                )
+                depth = np.nextafter(disk_depth(SIZE, len(rows)), np.float32(5000)).astype(
+                    np.float32
+                )
                 maps = np.zeros(depth.shape, np.uint8), np.full(depth.shape, 255, np.uint8)
-                rows.append(Row(sample, name, view, frames, depth, depth * np.float32(1.0001), {}, *maps))
+                rows.append(
+                    Row(sample, name, view, frames, depth, depth * np.float32(1.0001), {}, *maps)
+                )
             plans.append(plan)
             receipts.append(ShardWriter(manifest).write(folder, plan, rows))
     mesh = folder / "meshes" / "bowl.ply"
@@ -67,18 +75,24 @@ for line in sys.stdin:
         status = main(["publish", *json.loads(line)])
     print(json.dumps([status, out.getvalue(), err.getvalue()]), flush=True)
 """
-"""Runs one call a line: starting Python and importing the client takes longer than publishing these few kilobytes."""
+"""Runs one call a line: starting Python and importing the client takes longer than publishing these
+few kilobytes."""
 
 
 class Client:
-    """``fpp-bench publish`` in a process of its own, which alone sees the environment of one server."""
+    """``fpp-bench publish`` in a process of its own, which alone sees the environment of one
+    server."""
 
     def __init__(self, server: HubServer, home: Path) -> None:
         self.server, self.home = server, home
         self._process = self._start()
 
     def environment(self, **changes: str | None) -> dict[str, str]:
-        plain = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
+        plain = {
+            name: value
+            for name, value in os.environ.items()
+            if not name.startswith(("HF_", "HUGGING"))
+        }
         own = {
             "HF_ENDPOINT": self.server.endpoint,
             "HF_HUB_DISABLE_XET": "1",
@@ -143,4 +157,6 @@ def running_hub(home: Path) -> Iterator[Client]:
 
 def listed(output: str) -> dict[str, str]:
     """Status by path, as printed."""
-    return {path: status for status, path in re.findall(r"(?m)^  . (\w+) +[\d.]+ \w+  (.+)$", output)}
+    return {
+        path: status for status, path in re.findall(r"(?m)^  . (\w+) +[\d.]+ \w+  (.+)$", output)
+    }

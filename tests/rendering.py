@@ -1,4 +1,5 @@
-"""Scenes of the renderer's tests: a small rig, a light without anything but direct light, meshes and a studio."""
+"""Scenes of the renderer's tests: a small rig, a light without anything but direct light, meshes
+and a studio."""
 
 import numpy as np
 
@@ -10,17 +11,22 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(176)
 X, Y = RIG.camera.rays()
-CENTRE = np.array([-0.125, 0.1, 0.0])  # of the projector in the camera's frame, from rig.md's coordinates
+CENTRE = np.array([-0.125, 0.1, 0.0])
+"""Of the projector in the camera's frame, from rig.md's coordinates."""
 TOWARD_CAMERA = np.array([0.0, 0.0, -1.0])
 PAPER = named_light("paper").changed("camera", **camera_noise(0))
 """The paper's light without noise."""
-DIRECT = PAPER.changed("bounces", interreflection=False, ambient_occlusion=False).changed("camera", rays_across=1)
+DIRECT = PAPER.changed("bounces", interreflection=False, ambient_occlusion=False).changed(
+    "camera", rays_across=1
+)
 """Direct light alone, of a matte surface, seen by the central ray of each pixel."""
 ALL_PIXELS = np.arange(X.size, dtype=np.uint32)
 
 
 def solid(mesh, name="thing"):
-    return SolidMesh(name, np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int32))
+    return SolidMesh(
+        name, np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int32)
+    )
 
 
 def sheet(*rectangles, name="sheet"):

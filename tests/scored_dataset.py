@@ -1,4 +1,5 @@
-"""A tiny real dataset folder with known depth, and predictions for it: what the evaluator's tests score."""
+"""A tiny real dataset folder with known depth, and predictions for it: what the evaluator's tests
+score."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -29,14 +30,21 @@ DESCRIPTION: dict[str, Any] = {
     "uses_ground_truth_range": False,
     "seconds_per_sample": 0.25,
     "seconds_source": "measured",
-    "hardware": {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"},
+    "hardware": {
+        "cpu": "Some CPU",
+        "cores": 2,
+        "memory_gib": 8.0,
+        "gpu": None,
+        "platform": "Linux",
+    },
     "software": {"numpy": "2.0.0"},
     "settings": {"steps": 18},
 }
 
 
 def disk_depth(size: tuple[int, int], seed: int) -> NDArray[np.float32]:
-    """A tilted disk at 1.8 m with a step in it on an empty background, float32 (H, W) in mm; a place per seed."""
+    """A tilted disk at 1.8 m with a step in it on an empty background, float32 (H, W) in mm; a
+    place per seed."""
     height, width = size
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[:height, :width]
@@ -57,10 +65,12 @@ def make_dataset(
     scene: Scene | None = None,
     flagged: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None,
 ) -> DatasetFolder:
-    """Write a `single_shot` dataset, by default of eight samples; ``depth_exact`` is 0.5 mm more than ``depth``.
+    """Write a `single_shot` dataset, by default of eight samples; ``depth_exact`` is 0.5 mm more
+    than ``depth``.
 
-    ``scene`` gives frame and depth of a number that no other sample has; by default a flat frame and a `disk_depth`.
-    ``flagged`` gives the flags of a depth, by default none. Unlit pixels lose their ``depth``, not their exact one.
+    ``scene`` gives frame and depth of a number that no other sample has; by default a flat frame
+    and a `disk_depth`. ``flagged`` gives the flags of a depth, by default none. Unlit pixels lose
+    their ``depth``, not their exact one.
     """
     manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), size, "single_shot", exact)
     writer = ShardWriter(manifest)
@@ -72,7 +82,10 @@ def make_dataset(
             for index, (sample, name, view) in enumerate(plan.samples):
                 seed = 10 * len(views) * number + index
                 if scene is None:
-                    frame, depth = np.full(size, index, dtype=np.uint8), disk_depth(size, 10 * number + index)
+                    frame, depth = (
+                        np.full(size, index, dtype=np.uint8),
+                        disk_depth(size, 10 * number + index),
+                    )
                 else:
                     frame, depth = scene(seed)
                 exact_mm = depth + np.float32(0.5) * (depth > 0)
@@ -97,7 +110,9 @@ def make_dataset(
     return DatasetFolder(folder)
 
 
-def name_benchmarks(monkeypatch: Any, folder: Path, *named: tuple[Benchmark, DatasetFolder]) -> None:
+def name_benchmarks(
+    monkeypatch: Any, folder: Path, *named: tuple[Benchmark, DatasetFolder]
+) -> None:
     """Let the package know these benchmarks, and no others, by the facts of datasets."""
     folder.mkdir(exist_ok=True)
     for known, dataset in named:
@@ -115,7 +130,9 @@ def name_benchmarks(monkeypatch: Any, folder: Path, *named: tuple[Benchmark, Dat
     monkeypatch.setattr(benchmark, "BENCHMARKS", tuple(known for known, _ in named))
 
 
-def pixel_counts(dataset: DatasetFolder, split: str, mode: str, target: str) -> dict[str, list[int]]:
+def pixel_counts(
+    dataset: DatasetFolder, split: str, mode: str, target: str
+) -> dict[str, list[int]]:
     """Samples, object pixels and void pixels of each object of a split."""
     counts: dict[str, list[int]] = {}
     for sample in dataset.samples(split):
@@ -141,18 +158,24 @@ def write_predictions(
     noise_mm: float = 0.0,
     **changes: Any,
 ) -> Path:
-    """Predictions for a split: the target, an offset everywhere, and noise that leaves no depth negative."""
+    """Predictions for a split: the target, an offset everywhere, and noise that leaves no depth
+    negative."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, sample in enumerate(dataset.samples(split)):
         depth = dataset.depth_mm(sample)
-        noise = np.abs(np.random.default_rng(index).normal(0.0, noise_mm, depth.shape)) if noise_mm else 0.0
+        noise = (
+            np.abs(np.random.default_rng(index).normal(0.0, noise_mm, depth.shape))
+            if noise_mm
+            else 0.0
+        )
         np.save(folder / f"{sample}.npy", (depth + offset_mm + noise).astype(np.float32))
     write_description(folder, **changes)
     return folder
 
 
 def change_json(path: Path, key: str, value: Any) -> None:
-    """Set a value deep inside of a JSON file, at a key like ``per_sample.0.object``; ``...`` removes it."""
+    """Set a value deep inside of a JSON file, at a key like ``per_sample.0.object``; ``...``
+    removes it."""
     document = json.loads(path.read_text())
     *parents, last = (int(part) if part.isdecimal() else part for part in key.split("."))
     place = document

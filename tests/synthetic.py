@@ -17,7 +17,8 @@ SPLITS = {"train": ("bowl", "cork"), "validation": ("mug",), "test": ("power_dri
 
 @dataclass(frozen=True)
 class SyntheticRows:
-    """Rows of noise, a seed per sample; ``same`` gives a sample the frame of another, ``spoil`` a wrong depth."""
+    """Rows of noise, a seed per sample; ``same`` gives a sample the frame of another, ``spoil`` a
+    wrong depth."""
 
     same: tuple[tuple[str, str], ...] = ()
     spoil: tuple[str, float] | None = None
@@ -54,7 +55,9 @@ def assembly(splits=SPLITS, views=VIEWS, origin="generated", **changes):
     """A dataset of noise to be written."""
     plans = []
     for split, names in splits.items():
-        plans += plan_shards(split, {name: [(f"{name}_{v}", name, v) for v in views] for name in names})
+        plans += plan_shards(
+            split, {name: [(f"{name}_{v}", name, v) for v in views] for name in names}
+        )
     manifest = Manifest(
         origin=origin,
         generator={"name": "test", "version": "0"},

@@ -1,4 +1,5 @@
-"""The front door: its examples run as they are written, on a small dataset in the place of ``data/mini``."""
+"""The front door: its examples run as they are written, on a small dataset in the place of
+``data/mini``."""
 
 import ast
 import doctest
@@ -36,14 +37,20 @@ def test_the_examples_run(folder):
 
 def _section(function, title):
     """A section of a docstring: its lines, without their common indentation."""
-    found = re.search(rf"^{title}\n-+\n(.*?)(?=\n\n\S|\Z)", inspect.getdoc(function), flags=re.DOTALL | re.MULTILINE)
+    found = re.search(
+        rf"^{title}\n-+\n(.*?)(?=\n\n\S|\Z)",
+        inspect.getdoc(function),
+        flags=re.DOTALL | re.MULTILINE,
+    )
     return found[1]
 
 
 @pytest.mark.parametrize("name", api.__all__)
 def test_the_documented_parameters_are_those_of_the_function(name):
     function = getattr(api, name)
-    lines = re.findall(r"^(\S[^:\n]*?)(?: : .*)?$", _section(function, "Parameters"), flags=re.MULTILINE)
+    lines = re.findall(
+        r"^(\S[^:\n]*?)(?: : .*)?$", _section(function, "Parameters"), flags=re.MULTILINE
+    )
     documented = [word.strip().lstrip("*") for line in lines for word in line.split(",")]
     assert documented == [*inspect.signature(function).parameters]
 
@@ -58,14 +65,18 @@ def test_what_the_docstrings_say_of_the_results_is_there(folder):
         "load_dataset": SimpleNamespace(**dict.fromkeys(rows.column_names), frame_NN=None),
         "open_dataset": dataset,
         "load_method": fpp_ml_bench.load_method("phase", dataset),
-        "decode": fpp_ml_bench.decode(dataset.frames(dataset.samples("test")[0], range(52)), dataset.rig),
+        "decode": fpp_ml_bench.decode(
+            dataset.frames(dataset.samples("test")[0], range(52)), dataset.rig
+        ),
         "evaluate": scored,
         "compare": fpp_ml_bench.compare("result.json", scored),
         "rank": fpp_ml_bench.rank(["result.json"])[0],
     }
     assert sorted(returned) == sorted(api.__all__)
     for name, value in returned.items():
-        said = re.findall(r"``([\w.]+)(?:[(\[]\w+(?:, \w+)*[)\]])?``", _section(getattr(api, name), "Returns"))
+        said = re.findall(
+            r"``([\w.]+)(?:[(\[]\w+(?:, \w+)*[)\]])?``", _section(getattr(api, name), "Returns")
+        )
         assert len(said) >= 1
         for path in set(said) - {"result.json"}:
             assert operator.attrgetter(path)(value) is not None or name == "load_dataset", path
@@ -82,8 +93,12 @@ def test_the_documented_options_of_methods_exist(tiny):
         methods = re.search(rf"``{key}={re.escape(value)}`` \(([^;)]*)", parameters)[1]
         methods = {"both": "classical, phase"}.get(methods, methods)
         for method in methods.split(", "):
-            source = dataset.rig if method in names else dataset  # a network is for datasets of its own image size
-            loaded = load_method(names.get(method, method), source, **{key: ast.literal_eval(value)})
+            source = (
+                dataset.rig if method in names else dataset
+            )  # a network is for datasets of its own image size
+            loaded = load_method(
+                names.get(method, method), source, **{key: ast.literal_eval(value)}
+            )
             told = len(loaded.frames_used) if key == "frames" else loaded.settings[key]
             assert told == ast.literal_eval(value)
 

@@ -1,5 +1,6 @@
-"""Every place that opens a file of a stranger, writes one, draws or prints by a library, is listed here: a new one goes
-through the doors of `docs/architecture.md` ("Files from outside"), or is added with its reason."""
+"""Every place that opens a file of a stranger, writes one, draws or prints by a library, is listed
+here: a new one goes through the doors of `docs/architecture.md` ("Files from outside"), or is added
+with its reason."""
 
 import ast
 import re
@@ -33,7 +34,8 @@ DOORS = {
     },
     r"mmap\.mmap": {"loaders/storage/store.py"},  # of memory, of no file
     r"yaml\.(safe_)?load": {"fpp_ml_bench/files.py"},
-    # What writes a file: all others by files.write_atomically, write_files, whole_file or whole_folder.
+    # What writes a file: all others by files.write_atomically, write_files, whole_file or
+    # whole_folder.
     r"np\.save\w*\((?!content|buffer).*": set(),
     r".*\.write_(bytes|text)|shutil\.copy\w*": {
         "baselines/timing.py",  # a switch of the kernel
@@ -64,7 +66,11 @@ def calls():
         for path in sorted((ROOT / room).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call):
-                    yield path.relative_to(ROOT).as_posix(), ast.unparse(node.func), ast.unparse(node)
+                    yield (
+                        path.relative_to(ROOT).as_posix(),
+                        ast.unparse(node.func),
+                        ast.unparse(node),
+                    )
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,5 @@
-"""Packaging: every package folder is installed, and the checkout works as the current folder too."""
+"""Packaging: every package folder is installed, and the checkout works as the current folder
+too."""
 
 import ast
 import os
@@ -66,17 +67,28 @@ def test_every_data_file_is_installed():
     left = []
     for name, folder in _package_folders().items():
         patterns = data.get(name, ())
-        inner = [ROOT / other for other in _package_folders().values() if other.startswith(f"{folder}/")]
+        inner = [
+            ROOT / other for other in _package_folders().values() if other.startswith(f"{folder}/")
+        ]
         for file in sorted((ROOT / folder).rglob("*")):
             own = not any(file.is_relative_to(other) for other in inner)
-            if own and file.is_file() and file.suffix not in (".py", ".pyc", ".png", ".nbi", ".nbc"):
-                left += [file] if not any(file.relative_to(ROOT / folder).match(p) for p in patterns) else []
+            if (
+                own
+                and file.is_file()
+                and file.suffix not in (".py", ".pyc", ".png", ".nbi", ".nbc")
+            ):
+                left += (
+                    [file]
+                    if not any(file.relative_to(ROOT / folder).match(p) for p in patterns)
+                    else []
+                )
     assert left == []
 
 
 def test_checkout_as_current_folder_brings_its_own_subpackages():
     code = "import fpp_ml_bench, importlib\n" + "".join(
-        f"print(importlib.import_module('fpp_ml_bench.{subpackage}').__file__)\n" for subpackage in SUBPACKAGES
+        f"print(importlib.import_module('fpp_ml_bench.{subpackage}').__file__)\n"
+        for subpackage in SUBPACKAGES
     )
     printed = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
@@ -85,13 +97,19 @@ def test_checkout_as_current_folder_brings_its_own_subpackages():
 
 
 def test_module_run_is_the_command():
-    done = subprocess.run([sys.executable, "-m", "fpp_ml_bench", "--version"], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "fpp_ml_bench", "--version"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0
     assert done.stdout.startswith("fpp-ml-bench ")
 
 
 def test_dependencies_flow_one_way():
-    """core <- loaders <- evaluation <- baselines <- leaderboard; only the commands import all of them."""
+    """core <- loaders <- evaluation <- baselines <- leaderboard; only the commands import all of
+    them."""
     order = ("core", *SUBPACKAGES)
     for top in ("fpp_ml_bench", *SUBPACKAGES):
         position = order.index("core" if top == "fpp_ml_bench" else top)
@@ -103,20 +121,27 @@ def test_dependencies_flow_one_way():
                 continue
             text = path.read_text()
             for later_package in order[position + 1 :]:
-                assert f"fpp_ml_bench.{later_package}" not in text or _only_in_prose(text, later_package), (
-                    f"{path} imports {later_package}"
-                )
+                assert f"fpp_ml_bench.{later_package}" not in text or _only_in_prose(
+                    text, later_package
+                ), f"{path} imports {later_package}"
 
 
 def _only_in_prose(text: str, subpackage: str) -> bool:
     return not any(
-        line.strip().startswith((f"from fpp_ml_bench.{subpackage}", f"import fpp_ml_bench.{subpackage}"))
+        line.strip().startswith(
+            (f"from fpp_ml_bench.{subpackage}", f"import fpp_ml_bench.{subpackage}")
+        )
         for line in text.splitlines()
     )
 
 
 def test_the_project_refers_to_no_outside_folder():
-    elsewhere = {".git", ".venv", "build", "tmp"}  # tmp: of CI, where other tests make and remove folders meanwhile
+    elsewhere = {
+        ".git",
+        ".venv",
+        "build",
+        "tmp",
+    }  # tmp: of CI, where other tests make and remove folders meanwhile
     for folder, inner, names in os.walk(ROOT):
         inner[:] = [name for name in inner if name not in elsewhere]
         for path in (Path(folder, name) for name in names):
@@ -146,9 +171,23 @@ def _without_extras(folder, *words):
         (("train", "loss/l1", "DATA", "--out", "run"), "(torch|accelerate)", "train"),
         (("predict", "phase-net", "DATA", "--out", "predictions"), "torch", "train"),
         (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "safetensors", "train"),
-        (("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"), "torch", "train"),
         (
-            ("build", "--out", "more", "--objects", "cork", "--size", "176", "--cluster", "127.0.0.1:1"),
+            ("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"),
+            "torch",
+            "train",
+        ),
+        (
+            (
+                "build",
+                "--out",
+                "more",
+                "--objects",
+                "cork",
+                "--size",
+                "176",
+                "--cluster",
+                "127.0.0.1:1",
+            ),
             "ray",
             "cluster",
         ),
@@ -159,18 +198,22 @@ def test_a_missing_library_is_answered_with_its_extra(tiny, tmp_path, words, lib
     done = _without_extras(tmp_path, *(str(tiny) if word == "DATA" else word for word in words))
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert re.search(
-        rf"this needs {library}, which is not installed; pip install 'fpp-ml-bench\[{extra}\]'", done.stderr
+        rf"this needs {library}, which is not installed; pip install 'fpp-ml-bench\[{extra}\]'",
+        done.stderr,
     )
 
 
 def test_every_extra_lists_its_libraries():
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     for extra, libraries in EXTRAS.items():
         assert set(libraries) <= {re.split(r"[>=\[]", line)[0] for line in extras[extra]}
 
 
 def test_every_imported_library_is_a_dependency():
-    """What the package imports is of the standard library, a base dependency, or of an extra that `EXTRAS` names."""
+    """What the package imports is of the standard library, a base dependency, or of an extra that
+    `EXTRAS` names."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {"yaml": "pyyaml", "PIL": "pillow", "cv2": "opencv-contrib-python-headless"}
     base = {re.split(r"[>=\[]", line)[0].lower() for line in project["dependencies"]}
@@ -182,16 +225,22 @@ def test_every_imported_library_is_a_dependency():
                     imported |= {alias.name.partition(".")[0] for alias in node.names}
                 elif isinstance(node, ast.ImportFrom) and not node.level:
                     imported.add(str(node.module).partition(".")[0])
-    outside = imported - set(sys.stdlib_module_names) - {"fpp_ml_bench"} - set(sum(EXTRAS.values(), ()))
+    outside = (
+        imported - set(sys.stdlib_module_names) - {"fpp_ml_bench"} - set(sum(EXTRAS.values(), ()))
+    )
     needed = {names.get(name, name).lower().replace("_", "-") for name in outside}
     assert needed <= base, needed - base
     assert base <= needed, "a dependency that nothing imports"
 
 
 def test_ci_runs_every_command_without_extras():
-    """The script that CI runs in an environment without extras runs every command, not just its help."""
+    """The script that CI runs in an environment without extras runs every command, not just its
+    help."""
     script = (ROOT / ".ci/without_extras").read_text()
-    for name in set(COMMANDS) - {"publish", "demo"}:  # one needs the network, CI runs the other in the same environment
+    for name in set(COMMANDS) - {
+        "publish",
+        "demo",
+    }:  # one needs the network, CI runs the other in the same environment
         assert re.search(rf"^ *(needs \w+ )?fpp-bench {name} ", script, flags=re.MULTILINE), name
     for name in EVAL.commands:
         assert f"fpp-eval {name} " in script
@@ -201,17 +250,25 @@ def test_ci_runs_every_command_without_extras():
 
 def test_nothing_else_of_a_checkout_is_importable():
     code = (
-        "import importlib.util as u; print(u.find_spec('fpp_ml_bench.tests'), u.find_spec('fpp_ml_bench.benchmarks'))"
+        "import importlib.util as u; print(u.find_spec('fpp_ml_bench.tests'), "
+        "u.find_spec('fpp_ml_bench.benchmarks'))"
     )
-    printed = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    printed = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
     assert printed == "None None\n"
 
 
 def test_constraints_pin_what_every_extra_brings():
     """Of packages that are installed, also what they need in turn."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = [line.split("#")[0].strip() for line in (ROOT / "constraints.txt").read_text().splitlines()]
-    pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines if line)}
+    lines = [
+        line.split("#")[0].strip() for line in (ROOT / "constraints.txt").read_text().splitlines()
+    ]
+    pins = {
+        canonicalize_name(name): version
+        for name, version in (line.split("==") for line in lines if line)
+    }
     waiting = [
         Requirement(text)
         for texts in (project["dependencies"], *project["optional-dependencies"].values())
@@ -229,6 +286,8 @@ def test_constraints_pin_what_every_extra_brings():
         with suppress(metadata.PackageNotFoundError):
             extras = requirement.extras or {""}
             for needed in map(Requirement, metadata.requires(name) or ()):
-                if needed.marker is None or any(needed.marker.evaluate({"extra": extra}) for extra in extras):
+                if needed.marker is None or any(
+                    needed.marker.evaluate({"extra": extra}) for extra in extras
+                ):
                     waiting.append(needed)
     assert not problems

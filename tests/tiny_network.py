@@ -28,7 +28,9 @@ RECIPE: dict[str, Any] = {
 }
 
 
-def tiny_network(name: str = "unet", width: int = 4, seed: int = 0, **options: Any) -> torch.nn.Module:
+def tiny_network(
+    name: str = "unet", width: int = 4, seed: int = 0, **options: Any
+) -> torch.nn.Module:
     """A network with random weights, in eval mode; the same ``seed`` gives the same."""
     torch.manual_seed(seed)
     return build_network(name, width=width, **options).eval()
@@ -52,16 +54,21 @@ def config_of(network: torch.nn.Module, **changes: Any) -> ModelConfig:
 
 
 def rounding_error(network: nn.Module, output: Any) -> float:
-    """How far two float32 runs of ``network`` may be apart by rounding alone, in the unit of its ``output``.
+    """How far two float32 runs of ``network`` may be apart by rounding alone, in the unit of its
+    ``output``.
 
-    Kernels for AVX-512, AVX2 and SSE, other thread counts and other batch sizes add the terms of a sum in another
-    order. A sum of n terms is then off by about sqrt(n) eps of its size, and every layer adds an error of its own.
-    Errors that were measured under these instruction sets are 3% to 12% of this bound, which is itself 7e-5 to 3e-4 of
-    the largest output for the networks in `SMALL`.
+    Kernels for AVX-512, AVX2 and SSE, other thread counts and other batch sizes add the terms of a
+    sum in another order. A sum of n terms is then off by about sqrt(n) eps of its size, and every
+    layer adds an error of its own. Errors that were measured under these instruction sets are 3% to
+    12% of this bound, which is itself 7e-5 to 3e-4 of the largest output for the networks in
+    `SMALL`.
     """
-    layers = [m for m in network.modules() if isinstance(m, nn.Conv2d | nn.ConvTranspose2d | nn.Linear)]
+    layers = [
+        m for m in network.modules() if isinstance(m, nn.Conv2d | nn.ConvTranspose2d | nn.Linear)
+    ]
     longest_sum = max(
-        m.weight.numel() // (m.out_features if isinstance(m, nn.Linear) else m.out_channels) for m in layers
+        m.weight.numel() // (m.out_features if isinstance(m, nn.Linear) else m.out_channels)
+        for m in layers
     )
     largest = float(np.abs(np.asarray(output)).max())
     return len(layers) * longest_sum**0.5 * float(np.finfo(np.float32).eps) * largest
@@ -69,7 +76,8 @@ def rounding_error(network: nn.Module, output: Any) -> float:
 
 @pytest.fixture(autouse=True, scope="module")
 def one_thread():
-    """For every test of a module that imports it: on small maps threads cost more than they bring."""
+    """For every test of a module that imports it: on small maps threads cost more than they
+    bring."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

@@ -1,10 +1,12 @@
-"""Phase reliance (own probe): does the predicted depth follow the fringe's phase, or the object's outline? From 0 to 1.
+"""Phase reliance (own probe): does the predicted depth follow the fringe's phase, or the object's
+outline? From 0 to 1.
 
-Each test object is rendered again with a single property changed, so that the correct change of depth is known, and is
-compared with the change of the prediction. A sample's score is the product of `follows`, over moves of the phase within
-the object, and of 1 - `relative_change` under other outlines over the same phase, at least 0. The method's score is the
-mean over samples, with a bootstrap over objects. docs/diagnosis.md defines and explains it: units, missing predictions,
-and *order-free* values, which allow errors of whole periods.
+Each test object is rendered again with a single property changed, so that the correct change of
+depth is known, and is compared with the change of the prediction. A sample's score is the product
+of `follows`, over moves of the phase within the object, and of 1 - `relative_change` under other
+outlines over the same phase, at least 0. The method's score is the mean over samples, with a
+bootstrap over objects. docs/diagnosis.md defines and explains it: units, missing predictions, and
+*order-free* values, which allow errors of whole periods.
 """
 
 from collections import defaultdict
@@ -16,7 +18,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, silent, table_of
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    Figure,
+    Finding,
+    Probe,
+    ProbeSettings,
+    Progress,
+    silent,
+    table_of,
+)
 from fpp_ml_bench.baselines.diagnostics.scenes import (
     REPROJECTED,
     VIEWS_PER_OBJECT,
@@ -49,8 +59,9 @@ Map = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Change:
-    """Change of the prediction in a counterfactual scene, at the pixels that are compared. ``expected`` and ``actual``
-    change (n,) in the prediction's units; ``answered`` bool (n,): a prediction exists before and after."""
+    """Change of the prediction in a counterfactual scene, at the pixels that are compared.
+    ``expected`` and ``actual`` change (n,) in the prediction's units; ``answered`` bool (n,): a
+    prediction exists before and after."""
 
     expected: NDArray[np.float64]
     actual: NDArray[np.float64]
@@ -58,14 +69,16 @@ class Change:
 
     @classmethod
     def of(cls, before: Map, after: Map, expected: Map, answered: Mask) -> "Change":
-        """From two predictions and the expected change (n,); where it is not ``answered``, the actual change is 0."""
+        """From two predictions and the expected change (n,); where it is not ``answered``, the
+        actual change is 0."""
         actual = np.where(answered, np.subtract(after, before, dtype=np.float64), 0.0)
         return cls(np.asarray(expected, dtype=np.float64), actual, answered)
 
 
 def follows(changes: Sequence[Change]) -> float | None:
-    """Purity <d, t> / sqrt(<d, d> <t, t>) times min(gain, 1 / gain), gain = <d, t> / <t, t>, over all pixels of
-    ``changes``, with d the actual and t the expected change; 0 where <d, t> is not positive, None where t is 0."""
+    """Purity <d, t> / sqrt(<d, d> <t, t>) times min(gain, 1 / gain), gain = <d, t> / <t, t>, over
+    all pixels of ``changes``, with d the actual and t the expected change; 0 where <d, t> is not
+    positive, None where t is 0."""
     product, actual, expected = (
         sum(float(getattr(change, a) @ getattr(change, b)) for change in changes)
         for a, b in (("actual", "expected"), ("actual", "actual"), ("expected", "expected"))
@@ -85,22 +98,28 @@ def rms_expected(changes: Sequence[Change]) -> float:
 
 
 def relative_change(changes: Sequence[Change], unit: float) -> float | None:
-    """Root mean square of actual minus expected change, or of the actual change if that is less, divided by ``unit``,
-    as which a pixel that lost its prediction counts. None without pixels or with ``unit`` 0."""
+    """Root mean square of actual minus expected change, or of the actual change if that is less,
+    divided by ``unit``, as which a pixel that lost its prediction counts. None without pixels or
+    with ``unit`` 0."""
     size, total = sum(change.actual.size for change in changes), 0.0
     if unit <= 0 or not size:
         return None
     for change in changes:
-        differences = [np.where(change.answered, change.actual - expected, unit) for expected in (change.expected, 0.0)]
+        differences = [
+            np.where(change.answered, change.actual - expected, unit)
+            for expected in (change.expected, 0.0)
+        ]
         total += min(float(np.dot(values, values)) for values in differences)
     return float(np.sqrt(total / size) / unit)
 
 
 def order_free_follows(changes: Sequence[Change]) -> float | None:
-    """`follows` for changes of phase in rad, modulo whole periods: 1 - (1 - <cos(d - t)>) / (1 - <cos t>), at least 0.
-    A random prediction gets no credit: its <cos(d - t)> is 0, below that of a constant prediction."""
+    """`follows` for changes of phase in rad, modulo whole periods: 1 - (1 - <cos(d - t)>) / (1 -
+    <cos t>), at least 0. A random prediction gets no credit: its <cos(d - t)> is 0, below that of a
+    constant prediction."""
     actual, expected = (
-        np.concatenate([np.zeros(0), *(getattr(change, key) for change in changes)]) for key in ("actual", "expected")
+        np.concatenate([np.zeros(0), *(getattr(change, key) for change in changes)])
+        for key in ("actual", "expected")
     )
     standing_still = 1 - float(np.mean(np.cos(expected))) if expected.size else 0.0
     if standing_still <= 0:
@@ -110,7 +129,10 @@ def order_free_follows(changes: Sequence[Change]) -> float | None:
 
 def order_free(changes: Sequence[Change]) -> list[Change]:
     """Changes of phase in rad as chords, for `relative_change`: a whole period is no change."""
-    return [Change(2 * np.sin(one.expected / 2), 2 * np.sin(one.actual / 2), one.answered) for one in changes]
+    return [
+        Change(2 * np.sin(one.expected / 2), 2 * np.sin(one.actual / 2), one.answered)
+        for one in changes
+    ]
 
 
 def sample_score(follow: float | None, change: float | None) -> float | None:
@@ -119,8 +141,8 @@ def sample_score(follow: float | None, change: float | None) -> float | None:
 
 
 class SampleScenes:
-    """The scenes of a sample, and what ``method`` predicts of them, in its own units. ``outline_samples``: whose
-    outlines the object may be cut to."""
+    """The scenes of a sample, and what ``method`` predicts of them, in its own units.
+    ``outline_samples``: whose outlines the object may be cut to."""
 
     def __init__(
         self,
@@ -140,11 +162,14 @@ class SampleScenes:
 
     def predict(self, scene: Scene) -> NDArray[np.float32]:
         """Predicted depth (H, W) in the units of the method."""
-        frames = self.renderer.frames(scene, self.method.frames_used, self.method.uses_ground_truth_mask)
+        frames = self.renderer.frames(
+            scene, self.method.frames_used, self.method.uses_ground_truth_mask
+        )
         return checked(self.method.answer(frames), scene.depth_mm.shape, self.method.title).depth
 
     def true_depth(self, scene: Scene) -> NDArray[np.float64]:
-        """True depth (H, W) in the units of the method: mm, or normalised to its range over the scene's mask."""
+        """True depth (H, W) in the units of the method: mm, or normalised to its range over the
+        scene's mask."""
         depth_mm = scene.depth_mm
         if self.in_mm or not scene.mask.any():
             return depth_mm
@@ -160,12 +185,18 @@ class SampleScenes:
             return Change.of(before, after, expected, np.ones(before.shape, dtype=bool)), None
         change = Change.of(before, after, expected, (before != 0) & (after != 0))
         layer, answered = self.layer.at(where), (before > 0) & (after > 0)
-        first, second = (layer.absolute_phase(np.where(answered, depth_mm, 1000.0)) for depth_mm in (before, after))
-        true, moved = (layer.absolute_phase(scene.depth_mm[where]) for scene in (self.original, variant.scene))
+        first, second = (
+            layer.absolute_phase(np.where(answered, depth_mm, 1000.0))
+            for depth_mm in (before, after)
+        )
+        true, moved = (
+            layer.absolute_phase(scene.depth_mm[where]) for scene in (self.original, variant.scene)
+        )
         return change, Change.of(first, second, moved - true, answered)
 
     def parts(self) -> dict[str, float | None]:
-        """Both scores, ``score`` and ``order_free_score``, and the parts by the names of `RelianceParts`."""
+        """Both scores, ``score`` and ``order_free_score``, and the parts by the names of
+        `RelianceParts`."""
         changes: dict[str, list[Change]] = defaultdict(list)
         turns: dict[str, list[Change]] = defaultdict(list)
         for variant in self.variants:
@@ -178,7 +209,10 @@ class SampleScenes:
                 turns[key].append(turn)
         unit = rms_expected(changes["phase"])
         parts: dict[str, float | None] = {"score": None, "order_free_score": None}
-        parts |= {f"follows_{kind}": follows(changes[kind]) for kind in ("phase", "light", "both", "constant")}
+        parts |= {
+            f"follows_{kind}": follows(changes[kind])
+            for kind in ("phase", "light", "both", "constant")
+        }
         parts["change_outline"] = relative_change(changes["outline"], unit)
         parts["score"] = sample_score(parts["follows_phase"], parts["change_outline"])
         for key in (name.replace(" ", "_") for name in REPROJECTED):
@@ -189,7 +223,10 @@ class SampleScenes:
             if key.startswith("no_fringe"):
                 parts[f"answered_{key}"] = float(kept.mean())
         if self.in_mm:
-            follow, chords = order_free_follows(turns["phase"]), rms_expected(order_free(turns["phase"]))
+            follow, chords = (
+                order_free_follows(turns["phase"]),
+                rms_expected(order_free(turns["phase"])),
+            )
             outline = relative_change(order_free(turns["outline"]), chords)
             parts |= {"order_free_follows_phase": follow, "order_free_change_outline": outline}
             parts["order_free_score"] = sample_score(follow, outline)
@@ -206,17 +243,21 @@ def measure(
     chosen: Sequence[tuple[str, list[str]]],
     progress: Progress = silent,
 ) -> tuple[Reliance, PartsBySample]:
-    """The reliance block of a method on samples as of `chosen_samples`, and the values of every sample. Raises
-    `DiagnosisError` for a method of other units, and where no sample has a score."""
+    """The reliance block of a method on samples as of `chosen_samples`, and the values of every
+    sample. Raises `DiagnosisError` for a method of other units, and where no sample has a score."""
     if method.units not in ("mm", "normalised"):
-        raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
+        raise DiagnosisError(
+            f"units {method.units!r}: reliance is measured for predictions in mm, or normalised"
+        )
     renderer, samples = SceneRenderer.of(dataset), PartsBySample()
     for sample, outline_samples in chosen:
         progress(len(samples), len(chosen), sample)
         samples[sample] = SampleScenes(method, dataset, renderer, sample, outline_samples).parts()
     scored = {name: parts for name, parts in samples.items() if parts["score"] is not None}
     if not scored:
-        raise DiagnosisError("no sample's phase can be moved within the working range, so there is no score")
+        raise DiagnosisError(
+            "no sample's phase can be moved within the working range, so there is no score"
+        )
     objects = [dataset.measured(name)["object"] for name in scored]
     interval = object_interval([parts["score"] for parts in scored.values()], objects)
     keys = ("score", "order_free_score", *RelianceParts.model_fields)
@@ -224,7 +265,9 @@ def measure(
     reliance = Reliance(
         version=RELIANCE_VERSION,
         score=means.pop("score") or 0.0,
-        interval=[None, None] if interval is None else [min(max(end, 0.0), 1.0) for end in interval],
+        interval=[None, None]
+        if interval is None
+        else [min(max(end, 0.0), 1.0) for end in interval],
         order_free_score=means.pop("order_free_score"),
         parts=RelianceParts(**means),
         units="mm" if method.units == "mm" else "normalised",
@@ -239,8 +282,8 @@ def measure(
 
 
 def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> MovedPhase:
-    """The direction whose phase is moved for a method of these frames: their own. For both directions it is the
-    vertical, whose period is the shorter in depth."""
+    """The direction whose phase is moved for a method of these frames: their own. For both
+    directions it is the vertical, whose period is the shorter in depth."""
     if all(dataset.sequence.frames[index].kind == "crossed" for index in frames):
         return "crossed"
     directions = {dataset.sequence.frames[index].direction for index in frames}
@@ -248,14 +291,21 @@ def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> MovedPhase:
 
 
 class Counterfactual(Probe):
-    """The phase-reliance score over the counterfactual scenes of all test objects, with its parts and pictures."""
+    """The phase-reliance score over the counterfactual scenes of all test objects, with its parts
+    and pictures."""
 
     name = "counterfactual"
     title = "Counterfactual scenes"
     version = 2
     question = "Does the predicted depth follow the fringe's phase, or the object's outline?"
 
-    def run(self, subject: "Subject", dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+    def run(
+        self,
+        subject: "Subject",
+        dataset: DatasetFolder,
+        settings: ProbeSettings,
+        progress: Progress,
+    ) -> Finding:
         views = 1 if settings.quick else VIEWS_PER_OBJECT
         if settings.samples is not None:
             views = max(settings.samples // len(chosen_samples(dataset, "test", 1)), 1)
@@ -274,9 +324,15 @@ class Counterfactual(Probe):
 def summary(reliance: Reliance) -> str:
     """The score, and the hypothesis that it supports."""
     (low, high), order_free = reliance.interval, reliance.order_free_score
-    interval = f" (95% interval {low:.2f} to {high:.2f})" if low is not None and high is not None else ""
-    whole_periods = "" if order_free is None else f"; {order_free:.2f} ignoring errors of whole periods"
-    verdict = "It reads the phase in part." if reliance.score >= 0.1 else "It does not follow the phase."
+    interval = (
+        f" (95% interval {low:.2f} to {high:.2f})" if low is not None and high is not None else ""
+    )
+    whole_periods = (
+        "" if order_free is None else f"; {order_free:.2f} ignoring errors of whole periods"
+    )
+    verdict = (
+        "It reads the phase in part." if reliance.score >= 0.1 else "It does not follow the phase."
+    )
     if reliance.score >= 0.5 or (order_free or 0.0) >= 0.5:
         verdict = "It reads the phase."
     text = f"Phase reliance {reliance.score:.2f}{interval}{whole_periods}. {verdict}"
@@ -285,15 +341,25 @@ def summary(reliance: Reliance) -> str:
 
 def _draw_scenes(name: str, sample: SampleScenes) -> Figure:
     """One column per scene: captured frame, expected change and actual change."""
-    shown = [one for one in sample.variants if one.kind in ("phase", "outline", "projected") and one.amplitude_rad >= 0]
+    shown = [
+        one
+        for one in sample.variants
+        if one.kind in ("phase", "outline", "projected") and one.amplitude_rad >= 0
+    ]
     seen = np.logical_or.reduce([variant.scene.mask for variant in shown])
     left, top, width, height = cv2.boundingRect(seen.astype(np.uint8))
-    box = np.s_[max(top - MARGIN_PX, 0) : top + height + MARGIN_PX, max(left - MARGIN_PX, 0) : left + width + MARGIN_PX]
+    box = np.s_[
+        max(top - MARGIN_PX, 0) : top + height + MARGIN_PX,
+        max(left - MARGIN_PX, 0) : left + width + MARGIN_PX,
+    ]
     method, columns = sample.method, []
     for variant in shown:
         scene, index = variant.scene, method.frames_used[0]
         change, maps = sample.changes(variant)[0], np.full((2, *scene.mask.shape), np.nan)
-        maps[:, scene.mask & sample.original.mask] = change.expected, np.where(change.answered, change.actual, np.nan)
+        maps[:, scene.mask & sample.original.mask] = (
+            change.expected,
+            np.where(change.answered, change.actual, np.nan),
+        )
         images = sample.renderer.frames(scene, [index], method.uses_ground_truth_mask)[index], *maps
         columns.append([np.asarray(image)[box] for image in images])
     frames, *changes = zip(*columns, strict=True)
@@ -303,9 +369,12 @@ def _draw_scenes(name: str, sample: SampleScenes) -> Figure:
         rows[title] = [Picture(one, ERROR_COLOURS, -largest, largest) for one in maps]
     unit = "mm" if sample.in_mm else "of the range"
     title = (
-        f"{name}: one thing changed at a time; {sample.direction} phase; blue to red: -{largest:.3g} to {largest:.3g} "
+        f"{name}: one thing changed at a time; {sample.direction} phase; blue to red: "
+        f"-{largest:.3g} to {largest:.3g} "
         f"{unit}; white: no prediction"
     )
-    alt = f"Scenes of {name} with changed phase, outline or fringes, and the change of its prediction"
+    alt = (
+        f"Scenes of {name} with changed phase, outline or fringes, and the change of its prediction"
+    )
     titles = [f"{variant.kind}:\n{variant.name.replace(' ', chr(10), 1)}" for variant in shown]
     return Figure(title, alt, gallery(rows, titles, 1.3))

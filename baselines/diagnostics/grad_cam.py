@@ -1,10 +1,12 @@
-"""Grad-CAM for regression (paper Section 7.2): which pixels of a layer's activations change the mean prediction.
+"""Grad-CAM for regression (paper Section 7.2): which pixels of a layer's activations change the
+mean prediction.
 
-The heatmap of a layer is the ReLU of its channels' sum, each weighted by the mean gradient of the mean predicted value
-with respect to that channel (Selvaraju et al. 2017), resized to the image. It is correlated (Pearson, over all pixels)
-with the true depth's edges, the fringe's local standard deviation and the object. As a sanity check (Adebayo et al.
-2018) the heatmaps of random weights are measured too: if they are the same, they do not depend on what was learned. The
-same is measured on flat planes, as in the paper's Section 7.3.
+The heatmap of a layer is the ReLU of its channels' sum, each weighted by the mean gradient of the
+mean predicted value with respect to that channel (Selvaraju et al. 2017), resized to the image. It
+is correlated (Pearson, over all pixels) with the true depth's edges, the fringe's local standard
+deviation and the object. As a sanity check (Adebayo et al. 2018) the heatmaps of random weights are
+measured too: if they are the same, they do not depend on what was learned. The same is measured on
+flat planes, as in the paper's Section 7.3.
 """
 
 from collections import defaultdict
@@ -41,17 +43,18 @@ from fpp_ml_bench.tables import Table
 
 Image = NDArray[np.float32]
 Mean = dict[str, Any]
-"""``r``: mean of the correlations of so many ``samples``, and its 95% ``interval``, resampled over objects; None where
-there is none."""
+"""``r``: mean of the correlations of so many ``samples``, and its 95% ``interval``, resampled over
+objects; None where there is none."""
 Correlations = Mapping[tuple[str, str], Mapping[int, Sequence[float | None]]]
-"""Pearson's r of each sample, by column and layer, then by network: 0 is trained, others have random weights."""
+"""Pearson's r of each sample, by column and layer, then by network: 0 is trained, others have
+random weights."""
 
 PAPER = "grad_cam"
 SAMPLES, QUICK_SAMPLES = 30, 6
 SEEDS = 2
 PLANES = {"plane_0.5": 0.5, "plane_0.8": 0.8}
-"""Facing rectangles by their side, as a share of the image's. Our UNet takes the first for an object and the second,
-like the paper's its rectangle, for background."""
+"""Facing rectangles by their side, as a share of the image's. Our UNet takes the first for an
+object and the second, like the paper's its rectangle, for background."""
 EDGES, FRINGES, OBJECT, OWN = "edges", "fringes", "object", "own"
 """References; `OWN` is the trained network's heatmap."""
 RANDOM = "random_"
@@ -70,7 +73,8 @@ _EXAMPLES = 3
 
 
 class GradCam(Probe):
-    """Heatmaps of the test split against edges and fringes, for the network and for random weights."""
+    """Heatmaps of the test split against edges and fringes, for the network and for random
+    weights."""
 
     name = "grad-cam"
     title = "Grad-CAM"
@@ -78,20 +82,30 @@ class GradCam(Probe):
     without_network = "it has no gradient to follow"
     version = 4
 
-    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+    def run(
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress
+    ) -> Finding:
         samples = settings.choose(dataset.samples("test"), SAMPLES, QUICK_SAMPLES)
         if not samples:
-            raise DiagnosisError(f"{dataset.path}: split test holds no sample, which Grad-CAM needs")
+            raise DiagnosisError(
+                f"{dataset.path}: split test holds no sample, which Grad-CAM needs"
+            )
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
         subject = replace(subject, layer_names=cam_layers(subject))
         means = measure(subject, dataset, samples, seeds, progress)
         if means["average"][EDGES]["r"] is None:
             layers = ", ".join(subject.layer_names)
-            return Finding(skipped=f"the heatmaps of every layer of {subject.name} ({layers}) are constant.")
+            return Finding(
+                skipped=f"the heatmaps of every layer of {subject.name} ({layers}) are constant."
+            )
         protocol = {"samples": len(samples), "seeds": seeds}
-        means["planes"] = {one: measure(subject, dataset, [one], seeds, progress)["layers"] for one in PLANES}
+        means["planes"] = {
+            one: measure(subject, dataset, [one], seeds, progress)["layers"] for one in PLANES
+        }
         drawn = _draw_heatmaps(subject, dataset, samples)
-        return Finding(summary(means), {"protocol": protocol, **means}, table(means, len(samples)), drawn)
+        return Finding(
+            summary(means), {"protocol": protocol, **means}, table(means, len(samples)), drawn
+        )
 
 
 def cam_layers(subject: Subject) -> tuple[str, ...]:
@@ -100,9 +114,12 @@ def cam_layers(subject: Subject) -> tuple[str, ...]:
     return six if set(six) | {AVERAGE} == set(paper_layers(PAPER)) else subject.layer_names
 
 
-def heatmaps(network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor) -> dict[str, Image]:
-    """Grad-CAM of the mean prediction by layer: float32 (B, H, W) at the size of ``fringe`` (B, 1, H, W). Raises
-    `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction."""
+def heatmaps(
+    network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor
+) -> dict[str, Image]:
+    """Grad-CAM of the mean prediction by layer: float32 (B, H, W) at the size of ``fringe`` (B, 1,
+    H, W). Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach
+    the prediction."""
     heatmaps_by_layer = {}
     for name, layer in layers.items():
         cam = LayerGradCam(lambda x: network(x).mean(dim=(1, 2, 3)), layer)
@@ -111,7 +128,9 @@ def heatmaps(network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor
             heat = cam.attribute(fringe.detach().requires_grad_(True))
         except (RuntimeError, AssertionError, IndexError, AttributeError, TypeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise DiagnosisError(f"layer {name!r}: Grad-CAM failed ({reason}); leave it out") from None
+            raise DiagnosisError(
+                f"layer {name!r}: Grad-CAM failed ({reason}); leave it out"
+            ) from None
         if not isinstance(heat, Tensor) or heat.dim() != 4:
             raise DiagnosisError(f"layer {name!r}: expected activations (B, C, h, w); leave it out")
         scaled = LayerAttribution.interpolate(heat, tuple(fringe.shape[2:]), "bilinear")
@@ -120,8 +139,8 @@ def heatmaps(network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor
 
 
 def shown(subject: Subject, dataset: DatasetFolder, name: str) -> tuple[Tensor, dict[str, Any]]:
-    """The input (1, 1, H, W) of a sample or of one of `PLANES`, and its maps (H, W): edges, the fringe's local standard
-    deviation, and the object's mask."""
+    """The input (1, 1, H, W) of a sample or of one of `PLANES`, and its maps (H, W): edges, the
+    fringe's local standard deviation, and the object's mask."""
     if name in PLANES:
         renderer = SceneRenderer.of(dataset)
         scene = plane_scene(renderer, rectangle(renderer.shape, PLANES[name]), *FACING)
@@ -129,19 +148,26 @@ def shown(subject: Subject, dataset: DatasetFolder, name: str) -> tuple[Tensor, 
         depth_mm: NDArray = scene.depth_mm
     else:
         frames, depth_mm = subject.captured(dataset, name), dataset.depth_mm(name)
-    # Image px per fringe period at the standoff; of horizontal fringes where the frame has no direction.
-    period_px = dataset.rig.image_px_per_period("vertical" if subject.direction == "vertical" else "horizontal")
+    # Image px per fringe period at the standoff; of horizontal fringes where the frame has no
+    # direction.
+    period_px = dataset.rig.image_px_per_period(
+        "vertical" if subject.direction == "vertical" else "horizontal"
+    )
     variation = fringe_variation(np.asarray(frames[subject.frames_used[0]]), period_px)
     maps = {EDGES: edge_map(depth_mm), FRINGES: variation, OBJECT: object_mask(depth_mm)}
     return subject.input_batch([frames]), maps
 
 
 def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
-    """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32. The
-    window side is the smallest odd number of px that covers ``period_px``, at least 3; the border is mirrored."""
+    """Standard deviation of a fringe image (H, W) over a square window of one period, in grey
+    levels, float32. The window side is the smallest odd number of px that covers ``period_px``, at
+    least 3; the border is mirrored."""
     side = max(3, 2 * int(np.ceil((period_px - 1) / 2)) + 1)
     image = np.asarray(grey, dtype=np.float64)
-    mean, square = (cv2.blur(of, (side, side), borderType=cv2.BORDER_REFLECT_101) for of in (image, image * image))
+    mean, square = (
+        cv2.blur(of, (side, side), borderType=cv2.BORDER_REFLECT_101)
+        for of in (image, image * image)
+    )
     return np.sqrt(np.maximum(square - mean * mean, 0)).astype(np.float32)
 
 
@@ -158,11 +184,13 @@ def measure(
     seeds: int,
     progress: Progress,
 ) -> dict[str, Any]:
-    """`means_of` the correlations of every heatmap with the references, and of random weights' heatmaps with the
-    trained ones."""
+    """`means_of` the correlations of every heatmap with the references, and of random weights'
+    heatmaps with the trained ones."""
     network, untrained = subject.networks()
     networks = [network, *map(untrained, range(seeds))]
-    found: dict[tuple[str, str], dict[int, list[float | None]]] = defaultdict(lambda: defaultdict(list))
+    found: dict[tuple[str, str], dict[int, list[float | None]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
     edges_with_fringes: list[float | None] = []
     for done, name in enumerate(samples):
         fringe, compared = shown(subject, dataset, name)
@@ -177,21 +205,29 @@ def measure(
                     found[column, layer][number].append(correlation(heat[layer], reference))
         progress(done + 1, len(samples), f"Grad-CAM of {name}")
     objects = [split_sample_name(name)[0] for name in samples]
-    return means_of(found, subject.layer_names, objects) | {"edges_with_fringes": _mean([edges_with_fringes], objects)}
+    return means_of(found, subject.layer_names, objects) | {
+        "edges_with_fringes": _mean([edges_with_fringes], objects)
+    }
 
 
 def means_of(found: Correlations, layers: Sequence[str], objects: Sequence[str]) -> dict[str, Any]:
-    """For ``diagnose.json``: `Mean` by layer and column, and of all layers, with the paper's ratio, correlation with
-    edges over correlation with fringes, None where undefined; those of random weights are means over seeds."""
+    """For ``diagnose.json``: `Mean` by layer and column, and of all layers, with the paper's ratio,
+    correlation with edges over correlation with fringes, None where undefined; those of random
+    weights are means over seeds."""
 
     def means(names: Sequence[str]) -> dict[str, Any]:
         return {
-            column: _mean([values for layer in names for values in found[column, layer].values()], objects)
+            column: _mean(
+                [values for layer in names for values in found[column, layer].values()], objects
+            )
             for column in COLUMNS
         }
 
     rows, average = {layer: means([layer]) for layer in layers}, means(layers)
-    for column, mean in average.items():  # as in the paper's bottom row, with an interval over samples
+    for (
+        column,
+        mean,
+    ) in average.items():  # as in the paper's bottom row, with an interval over samples
         mean["r"] = mean_of(row[column]["r"] for row in rows.values())
     for row in (*rows.values(), average):
         edges, fringes = row[EDGES]["r"], row[FRINGES]["r"]
@@ -203,37 +239,60 @@ def _mean(columns: Sequence[Sequence[float | None]], objects: Sequence[str]) -> 
     """`Mean` over samples of each sample's mean over ``columns``."""
     values = [mean_of(of_sample) for of_sample in zip(*columns, strict=True)]
     interval = object_interval(values, objects)
-    return {"r": mean_of(values), "interval": interval, "samples": sum(r is not None for r in values)}
+    return {
+        "r": mean_of(values),
+        "interval": interval,
+        "samples": sum(r is not None for r in values),
+    }
 
 
 def summary(means: Mapping[str, Any]) -> str:
     """The result in two sentences."""
     edges, fringes, random_edges, random_fringes, both = (
         with_interval(mean["r"])
-        for mean in (*(means["average"][column] for column in list(COLUMNS)[:4]), means["edges_with_fringes"])
+        for mean in (
+            *(means["average"][column] for column in list(COLUMNS)[:4]),
+            means["edges_with_fringes"],
+        )
     )
     return (
-        f"Over the layers, heatmaps correlate with edges by {edges} (random weights: {random_edges}) and with fringe "
-        f"variation by {fringes} (random weights: {random_fringes}). Edges and fringe variation themselves correlate "
+        f"Over the layers, heatmaps correlate with edges by {edges} (random weights: "
+        f"{random_edges}) and with fringe "
+        f"variation by {fringes} (random weights: {random_fringes}). Edges and fringe variation "
+        f"themselves correlate "
         f"by {both}, because both are strong where the object is."
     )
 
 
 def table(means: Mapping[str, Any], samples: int) -> Table:
     """The paper's table with random weights beside it."""
-    rows = means["layers"] | {"average": means["average"], "edges with fringes": {EDGES: means["edges_with_fringes"]}}
-    rows |= {f"{layer}, {plane}": row for plane, layers in means["planes"].items() for layer, row in layers.items()}
+    rows = means["layers"] | {
+        "average": means["average"],
+        "edges with fringes": {EDGES: means["edges_with_fringes"]},
+    }
+    rows |= {
+        f"{layer}, {plane}": row
+        for plane, layers in means["planes"].items()
+        for layer, row in layers.items()
+    }
     title = f"Correlation of Grad-CAM over {samples} test samples"
     return table_of(title, "Layer", rows, COLUMNS | {"ratio": "Ratio edges / fringes"})
 
 
 def _draw_heatmaps(subject: Subject, dataset: DatasetFolder, samples: Sequence[str]) -> Figure:
     network, rows = subject.networks()[0], {}
-    examples = [samples[round(share * (len(samples) - 1))] for share in np.linspace(0, 1, _EXAMPLES)]
+    examples = [
+        samples[round(share * (len(samples) - 1))] for share in np.linspace(0, 1, _EXAMPLES)
+    ]
     for name in dict.fromkeys([*examples, *PLANES]):
         fringe, maps = shown(subject, dataset, name)
         heat = heatmaps(network, subject.layers_of(network), fringe)
-        rows[name] = [Picture(image) for image in (fringe[0, 0].numpy(), maps[EDGES], maps[FRINGES])]
+        rows[name] = [
+            Picture(image) for image in (fringe[0, 0].numpy(), maps[EDGES], maps[FRINGES])
+        ]
         rows[name] += [Picture(values[0], HEAT_COLOURS) for values in heat.values()]
-    title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
+    title, alt = (
+        "Heatmaps, each scaled to its own largest value",
+        "Input, edges, fringes and Grad-CAM by layer",
+    )
     return Figure(title, alt, gallery(rows, ("input", EDGES, FRINGES, *subject.layer_names)))

@@ -1,10 +1,12 @@
-"""Linear probing (paper Section 7.1), extended by a linear probe, the phase and order as targets, and controls.
+"""Linear probing (paper Section 7.1), extended by a linear probe, the phase and order as targets,
+and controls.
 
-Probes of two kinds are fitted to the layers of a network, of the same network with random weights, and to two controls:
-the raw input and the object's mask. Background has depth 0, so the mask alone explains much of an image's depth;
-therefore depth is measured on object pixels too. *Linear probes* have a weight per channel, the same at every pixel (a
-1 x 1 convolution), in closed form. *Four-convolution probes* are the paper's, which gives only "four convolutional
-layers"; the other choices are ours. Both learn from the network's batches as they come, so no activations are stored.
+Probes of two kinds are fitted to the layers of a network, of the same network with random weights,
+and to two controls: the raw input and the object's mask. Background has depth 0, so the mask alone
+explains much of an image's depth; therefore depth is measured on object pixels too. *Linear probes*
+have a weight per channel, the same at every pixel (a 1 x 1 convolution), in closed form.
+*Four-convolution probes* are the paper's, which gives only "four convolutional layers"; the other
+choices are ours. Both learn from the network's batches as they come, so no activations are stored.
 """
 
 from collections import defaultdict
@@ -20,7 +22,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, table_of
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    Figure,
+    Finding,
+    Probe,
+    ProbeSettings,
+    Progress,
+    table_of,
+)
 from fpp_ml_bench.baselines.diagnostics.scenes import truth
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, activations_of
 from fpp_ml_bench.constants import split_sample_name
@@ -35,11 +44,15 @@ SAMPLES, QUICK_SAMPLES = 120, 24  # training samples of the probes
 EPOCHS, QUICK_EPOCHS = 6, 4
 SEEDS = 2
 BATCH = 4
-PIXELS = 1024  # pixels drawn with replacement from each sample: so many over the image, and as many within the object
+PIXELS = 1024
+"""Pixels drawn with replacement from each sample: so many over the image, and as many within the
+object."""
 SHARE, LONGEST = 4, 120
-"""Image px per grid step, and the most grid points along a side; for larger images the step grows."""
+"""Image px per grid step, and the most grid points along a side; for larger images the step
+grows."""
 RIDGE = 1e-6
-"""Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
+"""Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels
+solvable."""
 WIDTH = 16
 LEARNING_RATE = 3e-3
 TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
@@ -50,7 +63,8 @@ OBJECT_DEPTH = "object_depth"  # depth on object pixels
 
 
 class Target(NamedTuple):
-    """What is read from a layer: its ``maps``, by the names in `truth`, and the mask ``where`` they are compared."""
+    """What is read from a layer: its ``maps``, by the names in `truth`, and the mask ``where`` they
+    are compared."""
 
     title: str
     maps: tuple[str, ...]
@@ -66,7 +80,8 @@ LINEAR: Targets = {
     "phase": Target("wrapped phase", ("sine", "cosine")),
     "order": Target("fringe order", ("order",)),
 }
-"""Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so has two maps."""
+"""Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so
+has two maps."""
 FRINGE = ("phase", "order")  # of these, what needs fringes of a single direction
 SPATIAL: Targets = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
 """Of the four-convolution probes, which are trained on the maps of the whole image."""
@@ -76,20 +91,23 @@ Networks = Mapping[tuple[str, int], nn.Module]
 """By `TRAINED` or `UNTRAINED`, and the seed of the weights."""
 Source = tuple[str, int, str]
 """What is probed: a network's name, the seed of its weights, and a layer."""
-MEAN: Source = CONTROLS, 0, "mean"  # predicting each target's mean over the training samples, the reference
+MEAN: Source = CONTROLS, 0, "mean"
+"""Predicting each target's mean over the training samples, the reference."""
 Maps = Mapping[Source, Tensor]
 Errors = dict[tuple[Source, str, int], list[float]]
 """Squared error of each validation sample, by what was probed, target and seed of the probe."""
 Score = dict[str, Any]
-"""``mse``: mean over samples and seeds. ``mse_of_mean``: error of predicting the training samples' mean everywhere.
-``r2`` = 1 - mse / mse_of_mean: 1 is perfect, 0 is no better than the mean. ``r2_interval``: 95%, resampled over
-objects, to first order for it is a ratio of two means. ``seeds``: r2 of each seed."""
+"""``mse``: mean over samples and seeds. ``mse_of_mean``: error of predicting the training samples'
+mean everywhere. ``r2`` = 1 - mse / mse_of_mean: 1 is perfect, 0 is no better than the mean.
+``r2_interval``: 95%, resampled over objects, to first order for it is a ratio of two means.
+``seeds``: r2 of each seed."""
 Scores = dict[str, dict[str, dict[str, Score]]]
 """By `TRAINED`, `UNTRAINED` or `CONTROLS`, then layer, then target."""
 
 
 class LinearProbing(Probe):
-    """Probes on frozen activations, trained on the training split and validated on the validation split."""
+    """Probes on frozen activations, trained on the training split and validated on the validation
+    split."""
 
     name = "linear"
     title = "Linear probing"
@@ -97,7 +115,9 @@ class LinearProbing(Probe):
     without_network = "it has no layers to probe"
     version = 3
 
-    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+    def run(
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress
+    ) -> Finding:
         train = settings.choose(_samples_with_object(dataset, "train"), SAMPLES, QUICK_SAMPLES)
         validation = settings.choose(_samples_with_object(dataset, "validation"))
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
@@ -110,13 +130,27 @@ class LinearProbing(Probe):
             progress(done, total, activity)
 
         network, untrained = subject.networks()
-        networks = {(TRAINED, 0): network} | {(UNTRAINED, seed): untrained(seed) for seed in range(seeds)}
-        targets = {name: one for name, one in LINEAR.items() if subject.direction != "both" or name not in FRINGE}
-        linear = scores(LinearProbes(subject, dataset, targets, tick).errors(networks, train, validation), validation)
+        networks = {(TRAINED, 0): network} | {
+            (UNTRAINED, seed): untrained(seed) for seed in range(seeds)
+        }
+        targets = {
+            name: one
+            for name, one in LINEAR.items()
+            if subject.direction != "both" or name not in FRINGE
+        }
+        linear = scores(
+            LinearProbes(subject, dataset, targets, tick).errors(networks, train, validation),
+            validation,
+        )
         # A linear probe of constant features is the mean itself.
         if not any(target["r2"] for layer in linear[TRAINED].values() for target in layer.values()):
             layers = ", ".join(subject.layer_names)
-            return Finding(skipped=f"every probed layer of {subject.name} ({layers}) is constant, so it holds nothing.")
+            return Finding(
+                skipped=(
+                    f"every probed layer of {subject.name} ({layers}) is constant, so it holds "
+                    f"nothing."
+                )
+            )
         # Each seed of the untrained network costs another forward pass per batch, so there is one.
         first = {key: one for key, one in networks.items() if key[1] == 0}
         probes = ConvolutionProbes(subject, dataset, SPATIAL, tick, seeds, epochs)
@@ -130,25 +164,36 @@ class LinearProbing(Probe):
 def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
     names = [name for name in dataset.samples(split) if object_mask(dataset.depth_mm(name)).any()]
     if not names:
-        raise DiagnosisError(f"{dataset.path}: split {split} holds no object; probes need training and validation data")
+        raise DiagnosisError(
+            f"{dataset.path}: split {split} holds no object; probes need training and validation "
+            f"data"
+        )
     return names
 
 
 def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
-    """Activations (B, C, h, w) resized to a new tensor ``(B, C, *side)``: area means to shrink, bilinear to enlarge."""
+    """Activations (B, C, h, w) resized to a new tensor ``(B, C, *side)``: area means to shrink,
+    bilinear to enlarge."""
     if features.shape[2] >= side[0] and features.shape[3] >= side[1]:
         return functional.adaptive_avg_pool2d(features, side)
     return functional.interpolate(features, size=side, mode="bilinear", align_corners=False)
 
 
 def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Activations (B, C, h, w) at ``pixels`` (B, P), flat indices into an image of ``size``: (B, C, 1, P); those of
-    layers of another size are interpolated bilinearly between their pixel centres."""
+    """Activations (B, C, h, w) at ``pixels`` (B, P), flat indices into an image of ``size``: (B, C,
+    1, P); those of layers of another size are interpolated bilinearly between their pixel
+    centres."""
     if tuple(features.shape[2:]) == size:
-        return features.flatten(2).gather(2, pixels[:, None].expand(-1, features.shape[1], -1))[:, :, None]
+        return features.flatten(2).gather(2, pixels[:, None].expand(-1, features.shape[1], -1))[
+            :, :, None
+        ]
     rows, columns = pixels // size[1], pixels % size[1]
-    position = torch.stack([(2 * columns + 1) / size[1] - 1, (2 * rows + 1) / size[0] - 1], dim=-1).to(features.dtype)
-    return functional.grid_sample(features, position[:, None], "bilinear", "border", align_corners=False)
+    position = torch.stack(
+        [(2 * columns + 1) / size[1] - 1, (2 * rows + 1) / size[0] - 1], dim=-1
+    ).to(features.dtype)
+    return functional.grid_sample(
+        features, position[:, None], "bilinear", "border", align_corners=False
+    )
 
 
 class NormalEquations:
@@ -172,17 +217,22 @@ class NormalEquations:
         return self.cross[-1] / self.count
 
     def standard(self, least_spread: float = 1e-9) -> tuple[Tensor, Tensor]:
-        """Mean and 1 / standard deviation of each feature, (C,); 0 for a constant one, which removes it. Constant: its
-        spread is below ``least_spread``, relative to 1 plus its mean."""
+        """Mean and 1 / standard deviation of each feature, (C,); 0 for a constant one, which
+        removes it. Constant: its spread is below ``least_spread``, relative to 1 plus its mean."""
         mean = self.inner[-1, :-1] / self.count
         spread = (self.inner.diagonal()[:-1] / self.count - mean * mean).clamp(min=0).sqrt()
-        return mean, torch.where(spread > least_spread * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread))
+        return mean, torch.where(
+            spread > least_spread * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread)
+        )
 
     def solve(self, strength: float = RIDGE) -> Tensor:
-        """Weights (C + 1, T) float64, the last row the bias, of least squared error plus ``strength`` times N times
-        the squared weights of standardised features; the bias is free."""
+        """Weights (C + 1, T) float64, the last row the bias, of least squared error plus
+        ``strength`` times N times the squared weights of standardised features; the bias is
+        free."""
         (mean, factor), target = self.standard(), self.target_mean
-        inner = (self.inner[:-1, :-1] / self.count - torch.outer(mean, mean)) * torch.outer(factor, factor)
+        inner = (self.inner[:-1, :-1] / self.count - torch.outer(mean, mean)) * torch.outer(
+            factor, factor
+        )
         cross = (self.cross[:-1] / self.count - torch.outer(mean, target)) * factor[:, None]
         inner.diagonal().add_(strength)
         weight = torch.linalg.solve(inner, cross) * factor[:, None]
@@ -196,10 +246,10 @@ def apply(weights: Tensor, features: Tensor) -> Tensor:
 
 @dataclass(eq=False)
 class LinearProbes:
-    """Probes of all ``targets`` for all sources together: a weight per channel, the same at every pixel. They see
-    pixels drawn from each sample over the image and then within its object, the same for every network, as maps
-    (B, C, 1, 2 P). ``tick`` is called with the number of samples just looked at and the activity. ``seeds`` and
-    ``epochs`` are those of `ConvolutionProbes`."""
+    """Probes of all ``targets`` for all sources together: a weight per channel, the same at every
+    pixel. They see pixels drawn from each sample over the image and then within its object, the
+    same for every network, as maps (B, C, 1, 2 P). ``tick`` is called with the number of samples
+    just looked at and the activity. ``seeds`` and ``epochs`` are those of `ConvolutionProbes`."""
 
     subject: Subject
     dataset: DatasetFolder
@@ -210,16 +260,21 @@ class LinearProbes:
     batch: ClassVar[int | None] = None  # samples at once, None for as many as the subject's
 
     def __post_init__(self) -> None:
-        self.maps = list(dict.fromkeys(name for target in self.targets.values() for name in target.maps))
+        self.maps = list(
+            dict.fromkeys(name for target in self.targets.values() for name in target.maps)
+        )
         self.equations: dict[tuple[Source, str], NormalEquations] = {}
 
     def errors(self, networks: Networks, train: Sequence[str], validation: Sequence[str]) -> Errors:
-        """Errors on the samples ``validation`` of probes that are fitted to the samples ``train``, and `MEAN`'s."""
+        """Errors on the samples ``validation`` of probes that are fitted to the samples ``train``,
+        and `MEAN`'s."""
         for features, true in self.batches(networks, train, "statistics of the activations"):
             self.observe(features, true)
         self.start(len(train))
         for epoch in range(self.epochs):
-            shuffled = [train[index] for index in np.random.default_rng([1, epoch]).permutation(len(train))]
+            shuffled = [
+                train[index] for index in np.random.default_rng([1, epoch]).permutation(len(train))
+            ]
             for features, true in self.batches(networks, shuffled, "training probes"):
                 self.step(features, true)
         errors: Errors = defaultdict(list)
@@ -231,26 +286,34 @@ class LinearProbes:
     def batches(
         self, networks: Networks, samples: Sequence[str], activity: str
     ) -> Iterator[tuple[dict[Source, Tensor], dict[str, Tensor]]]:
-        """The controls and the activations of every layer (B, C, h, w), and the true maps and masks (B, 1, h, w)."""
+        """The controls and the activations of every layer (B, C, h, w), and the true maps and masks
+        (B, 1, h, w)."""
         for names, fringe in self.subject.batches(self.dataset, samples, self.batch):
             reduce = partial(self.reduce, names=names)
-            masks = np.stack([[object_mask(self.dataset.depth_mm(name))] for name in names], dtype=np.float32)
+            masks = np.stack(
+                [[object_mask(self.dataset.depth_mm(name))] for name in names], dtype=np.float32
+            )
             images = {INPUT: fringe, SILHOUETTE: torch.from_numpy(masks)}
             features = {(CONTROLS, 0, name): reduce(image) for name, image in images.items()}
             for network_key, network in networks.items():
                 layers = self.subject.layers_of(network)
                 found = activations_of(network, layers, fringe, reduce, self.subject.name)
-                features |= {(*network_key, layer): activations for layer, activations in found.items()}
+                features |= {
+                    (*network_key, layer): activations for layer, activations in found.items()
+                }
             true = [self.true_maps(name) for name in names]
             yield features, {key: torch.cat([maps[key] for maps in true]) for key in true[0]}
             self.tick(len(names), activity)
 
     @cache  # noqa: B019
     def true_maps(self, name: str) -> dict[str, Tensor]:
-        """The true maps of a sample where probes look, with the masks ``image`` and ``object``, (1, 1, h, w); kept."""
+        """The true maps of a sample where probes look, with the masks ``image`` and ``object``, (1,
+        1, h, w); kept."""
         direction = "horizontal" if self.subject.direction == "both" else self.subject.direction
         maps = truth(self.dataset.depth_mm(name), self.dataset.rig, direction)
-        reduced = {key: self.reduce(torch.from_numpy(one)[None, None], [name]) for key, one in maps.items()}
+        reduced = {
+            key: self.reduce(torch.from_numpy(one)[None, None], [name]) for key, one in maps.items()
+        }
         reduced["image"], reduced["object"] = self.masks(reduced["object"])
         return reduced
 
@@ -258,17 +321,24 @@ class LinearProbes:
     def drawn(self, name: str) -> Tensor:
         """Flat indices of a sample's pixels, (2 P,)."""
         split = self.dataset.split_of_sample(name)
-        rng = np.random.default_rng([list(self.dataset.splits).index(split), self.dataset.samples(split).index(name)])
+        rng = np.random.default_rng(
+            [list(self.dataset.splits).index(split), self.dataset.samples(split).index(name)]
+        )
         mask = object_mask(self.dataset.depth_mm(name))
         over_image, inside = rng.integers(mask.size, size=PIXELS), np.flatnonzero(mask)
-        return torch.from_numpy(np.concatenate([over_image, inside[rng.integers(inside.size, size=PIXELS)]]))
+        return torch.from_numpy(
+            np.concatenate([over_image, inside[rng.integers(inside.size, size=PIXELS)]])
+        )
 
     def reduce(self, maps: Tensor, names: Sequence[str]) -> Tensor:
         """Maps (B, C, H, W) of the samples ``names`` where probes look, in a new tensor."""
-        return at_pixels(maps, torch.stack([self.drawn(name) for name in names]), self.subject.image_size)
+        return at_pixels(
+            maps, torch.stack([self.drawn(name) for name in names]), self.subject.image_size
+        )
 
     def masks(self, share: Tensor) -> tuple[Tensor, Tensor]:
-        """The places over the image and those within the object, whose mask is ``share`` there, (1, 1, h, w)."""
+        """The places over the image and those within the object, whose mask is ``share`` there, (1,
+        1, h, w)."""
         within = (torch.arange(2 * PIXELS) >= PIXELS).float().expand_as(share)
         return 1 - within, within
 
@@ -288,7 +358,9 @@ class LinearProbes:
     def mean(self, name: str) -> Tensor:
         """Mean (T, 1, 1) of the maps of a target."""
         place = self.targets[name].where
-        means = next(equations for (_, where), equations in self.equations.items() if where == place).target_mean
+        means = next(
+            equations for (_, where), equations in self.equations.items() if where == place
+        ).target_mean
         return means[self.columns(name)][:, None, None]
 
     def start(self, samples: int) -> None:
@@ -302,32 +374,42 @@ class LinearProbes:
         """The maps (B, T, h, w) of a target, by source and seed of the probe."""
         columns, where = self.columns(name), self.targets[name].where
         return {
-            (source, 0): apply(self.weights[source, where][:, columns], maps.movedim(1, -1)).movedim(-1, 1)
+            (source, 0): apply(
+                self.weights[source, where][:, columns], maps.movedim(1, -1)
+            ).movedim(-1, 1)
             for source, maps in features.items()
         }
 
     @torch.no_grad()
     def errors_of_batch(self, features: Maps, true: Mapping[str, Tensor]) -> Errors:
-        """Mean squared error on each sample of a batch, by source, target, and seed; with `MEAN`'s."""
+        """Mean squared error on each sample of a batch, by source, target, and seed; with
+        `MEAN`'s."""
         errors = {}
         for name, target in self.targets.items():
-            maps, mask = torch.cat([true[one] for one in target.maps], dim=1).double(), true[target.where]
-            for (source, seed), predicted in {(MEAN, 0): self.mean(name), **self.predictions(features, name)}.items():
+            maps, mask = (
+                torch.cat([true[one] for one in target.maps], dim=1).double(),
+                true[target.where],
+            )
+            for (source, seed), predicted in {
+                (MEAN, 0): self.mean(name),
+                **self.predictions(features, name),
+            }.items():
                 square = (predicted - maps).square().mean(1, keepdim=True) * mask
                 errors[source, name, seed] = (square.sum((1, 2, 3)) / mask.sum((1, 2, 3))).tolist()
         return errors
 
 
 def grid_of(size: tuple[int, int]) -> tuple[int, int]:
-    """Grid points (h, w) for images of ``size``: one for 4 x 4 px up to 480 px, for 8 x 8 px at 960."""
+    """Grid points (h, w) for images of ``size``: one for 4 x 4 px up to 480 px, for 8 x 8 px at
+    960."""
     step = max(SHARE, -(-max(size) // LONGEST))
     return max(1, size[0] // step), max(1, size[1] // step)
 
 
 class ConvolutionProbe(nn.Module):
-    """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``.
-    The first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is
-    5 x 5 grid points."""
+    """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give
+    ``target_mean``. The first is narrow so that layers of 8 and of 1024 channels get probes of
+    similar capacity. The receptive field is 5 x 5 grid points."""
 
     def __init__(self, observed: NormalEquations, target_mean: float) -> None:
         super().__init__()
@@ -350,8 +432,8 @@ class ConvolutionProbe(nn.Module):
 
 
 class ConvolutionProbes(LinearProbes):
-    """Four-convolution probes on a coarse grid (B, C, h, w), trained together with Adam and cosine decay over
-    ``epochs``; ``seeds``: how many each layer gets, of random weights one."""
+    """Four-convolution probes on a coarse grid (B, C, h, w), trained together with Adam and cosine
+    decay over ``epochs``; ``seeds``: how many each layer gets, of random weights one."""
 
     batch = BATCH
 
@@ -359,7 +441,8 @@ class ConvolutionProbes(LinearProbes):
         return at_size(maps, grid_of(self.subject.image_size))
 
     def masks(self, share: Tensor) -> tuple[Tensor, Tensor]:
-        # Cells across the outline mix depth with background; of a tiny object those with the largest share count.
+        # Cells across the outline mix depth with background; of a tiny object those with the
+        # largest share count.
         return torch.ones_like(share), (share == share.max()).float()
 
     def start(self, samples: int) -> None:
@@ -369,9 +452,13 @@ class ConvolutionProbes(LinearProbes):
             for seed in range(seeds):
                 with torch.random.fork_rng(devices=[]):
                     torch.manual_seed(seed)
-                    probe = ConvolutionProbe(self.equations[source, where], float(self.mean(target)))
+                    probe = ConvolutionProbe(
+                        self.equations[source, where], float(self.mean(target))
+                    )
                 self.probes[source, target, seed] = probe
-        parameters = [parameter for probe in self.probes.values() for parameter in probe.parameters()]
+        parameters = [
+            parameter for probe in self.probes.values() for parameter in probe.parameters()
+        ]
         self._optimiser = torch.optim.Adam(parameters, lr=LEARNING_RATE, foreach=True)
         steps = max(1, self.epochs * -(-samples // BATCH))
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, steps)
@@ -379,7 +466,8 @@ class ConvolutionProbes(LinearProbes):
     def step(self, features: Maps, true: Mapping[str, Tensor]) -> None:
         self._optimiser.zero_grad(set_to_none=True)
         for (source, target, _), probe in self.probes.items():
-            # One backward pass per probe: a graph of all probes would hold every intermediate map at once.
+            # One backward pass per probe: a graph of all probes would hold every intermediate map
+            # at once.
             functional.mse_loss(probe(features[source]), true[target]).backward()
         self._optimiser.step()
         self._schedule.step()
@@ -387,7 +475,9 @@ class ConvolutionProbes(LinearProbes):
     def predictions(self, features: Maps, name: str) -> dict[tuple[Source, int], Tensor]:
         (target,) = self.targets[name].maps
         return {
-            (source, seed): probe(features[source]) for (source, of, seed), probe in self.probes.items() if of == target
+            (source, seed): probe(features[source])
+            for (source, of, seed), probe in self.probes.items()
+            if of == target
         }
 
 
@@ -400,13 +490,17 @@ def scores(errors: Errors, validation: Sequence[str]) -> Scores:
     objects = [split_sample_name(name)[0] for name in validation]
     found: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
     for (network, layer, target), columns in of_seeds.items():
-        found[network].setdefault(layer, {})[target] = score(columns, errors[MEAN, target, 0], objects)
+        found[network].setdefault(layer, {})[target] = score(
+            columns, errors[MEAN, target, 0], objects
+        )
     return found
 
 
-def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects: Sequence[str]) -> Score:
-    """`Score` of ``errors`` (seeds, samples), squared, against those of the mean, ``reference`` (samples,). Raises
-    ``ValueError`` where the reference error is 0, so for a constant target."""
+def score(
+    errors: Sequence[Sequence[float]], reference: Sequence[float], objects: Sequence[str]
+) -> Score:
+    """`Score` of ``errors`` (seeds, samples), squared, against those of the mean, ``reference``
+    (samples,). Raises ``ValueError`` where the reference error is 0, so for a constant target."""
     table = np.asarray(errors, dtype=np.float64)
     mean_error = float(np.mean(reference))
     if not mean_error > 0:
@@ -414,9 +508,11 @@ def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects
     sample_means = table.mean(axis=0)
     mse = float(sample_means.mean())
     r2 = 1 - mse / mean_error
-    # To first order, r2 of a resample differs by -mean(sample_means - (1 - r2) reference) / mean_error. Large objects
-    # have large errors in both terms, which cancels.
-    deviation = object_interval(((sample_means - (1 - r2) * np.asarray(reference)) / mean_error).tolist(), objects)
+    # To first order, r2 of a resample differs by -mean(sample_means - (1 - r2) reference) /
+    # mean_error. Large objects have large errors in both terms, which cancels.
+    deviation = object_interval(
+        ((sample_means - (1 - r2) * np.asarray(reference)) / mean_error).tolist(), objects
+    )
     return {
         "mse": mse,
         "r2": r2,
@@ -436,35 +532,47 @@ def summary(linear: Scores, spatial: Scores) -> str:
     edges, depth, on_object = (f"{mean_over(spatial[TRAINED], target):.2f}" for target in SPATIAL)
     mask = {target: f"{one['r2']:.2f}" for target, one in spatial[CONTROLS][SILHOUETTE].items()}
     text = (
-        f"On average over layers R2 is {edges} for edges (from the object's mask alone: {mask['edges']}), {depth} for "
-        f"depth (mask: {mask['depth']}) and {on_object} for depth on object pixels (mask: {mask[OBJECT_DEPTH]}, random "
+        f"On average over layers R2 is {edges} for edges (from the object's mask alone: "
+        f"{mask['edges']}), {depth} for "
+        f"depth (mask: {mask['depth']}) and {on_object} for depth on object pixels (mask: "
+        f"{mask[OBJECT_DEPTH]}, random "
         f"weights: {mean_over(spatial[UNTRAINED], OBJECT_DEPTH):.2f})."
     )
     if "phase" in linear[CONTROLS][INPUT]:
         phase = {layer: scores["phase"]["r2"] for layer, scores in linear[TRAINED].items()}
         best, last = max(phase, key=phase.__getitem__), list(phase)[-1]
         text += (
-            f" Linear probes read the wrapped phase best from {best} (R2 {phase[best]:.2f}); from the last layer, "
-            f"{last}, they reach R2 {phase[last]:.2f} (random weights: {linear[UNTRAINED][last]['phase']['r2']:.2f})."
+            f" Linear probes read the wrapped phase best from {best} (R2 {phase[best]:.2f}); from "
+            f"the last layer, "
+            f"{last}, they reach R2 {phase[last]:.2f} (random weights: "
+            f"{linear[UNTRAINED][last]['phase']['r2']:.2f})."
         )
     return text
 
 
 def table(spatial: Scores) -> Table:
-    """The paper's table, with its ratio of depth's MSE to edges', and the same probes as shares of variance."""
+    """The paper's table, with its ratio of depth's MSE to edges', and the same probes as shares of
+    variance."""
     trained = spatial[TRAINED]
 
     def row(layers: Mapping[str, Mapping[str, Score]], layer: str | None = None) -> dict[str, Any]:
         """Means over ``layers``, with the interval of a ``layer``."""
         mse = {f"mse {key}": mean_over(layers, key, "mse") for key in SPATIAL}
         intervals = {key: layers[layer][key]["r2_interval"] if layer else None for key in SPATIAL}
-        r2 = {f"r2 {key}": {"r": mean_over(layers, key), "interval": ends} for key, ends in intervals.items()}
+        r2 = {
+            f"r2 {key}": {"r": mean_over(layers, key), "interval": ends}
+            for key, ends in intervals.items()
+        }
         return {**mse, **r2}
 
     rows = {layer: row({layer: targets}, layer) for layer, targets in trained.items()}
     rows |= {"average": row(trained), "average, random weights": row(spatial[UNTRAINED])}
-    rows |= {CONTROL_TITLES[name]: row({name: targets}) for name, targets in spatial[CONTROLS].items()}
-    rows["predicting the mean"] = {f"mse {key}": mean_over(trained, key, "mse_of_mean") for key in SPATIAL}
+    rows |= {
+        CONTROL_TITLES[name]: row({name: targets}) for name, targets in spatial[CONTROLS].items()
+    }
+    rows["predicting the mean"] = {
+        f"mse {key}": mean_over(trained, key, "mse_of_mean") for key in SPATIAL
+    }
     for numbers in rows.values():
         numbers["ratio"] = numbers["mse depth"] / numbers["mse edges"]
     columns = {f"mse {key}": f"MSE, {target.title}" for key, target in SPATIAL.items()}
@@ -475,8 +583,8 @@ def table(spatial: Scores) -> Table:
 
 @styled
 def draw(linear: Scores) -> Figure:
-    """R2 of the linear probes by layer, a panel for each target: trained, with intervals, random weights with the range
-    of seeds, and controls."""
+    """R2 of the linear probes by layer, a panel for each target: trained, with intervals, random
+    weights with the range of seeds, and controls."""
     targets, layers = list(linear[CONTROLS][INPUT]), list(linear[TRAINED])
     drawn, panels_of = panels([LINEAR[target].title for target in targets], 3, 4.4, 3.0)
     for axes, target in zip(panels_of, targets, strict=True):
@@ -485,9 +593,13 @@ def draw(linear: Scores) -> Figure:
             ("random weights", UNTRAINED, "s--", "seeds", LINE_COLOURS[6]),
         ):
             scores = [linear[network][layer][target] for layer in layers]
-            axes.plot(layers, [one["r2"] for one in scores], style, color=colour, label=label, **LINE)
+            axes.plot(
+                layers, [one["r2"] for one in scores], style, color=colour, label=label, **LINE
+            )
             for layer, one in zip(layers, scores, strict=True):
-                axes.plot([layer] * len(one[ends] or ()), one[ends] or (), color=colour, linewidth=0.8)
+                axes.plot(
+                    [layer] * len(one[ends] or ()), one[ends] or (), color=colour, linewidth=0.8
+                )
         for (control, label), style in zip(CONTROL_TITLES.items(), (":", "-."), strict=True):
             level = [linear[CONTROLS][control][target]["r2"]] * len(layers)
             axes.plot(layers, level, style, color=INK, label=label, **LINE)

@@ -1,8 +1,10 @@
-"""What all probes share: their base class, settings and results, how these are stored, drawn and reported.
+"""What all probes share: their base class, settings and results, how these are stored, drawn and
+reported.
 
-A `Subject` is the model that is diagnosed, a `Probe` is one test of it, and a `Finding` is the probe's result;
-`diagnose` puts them on one page, which loads nothing, and into a JSON file. A probe gives rows for tables, and lines or
-pictures for figures; `style.panels` and `style.gallery` draw them in one style.
+A `Subject` is the model that is diagnosed, a `Probe` is one test of it, and a `Finding` is the
+probe's result; `diagnose` puts them on one page, which loads nothing, and into a JSON file. A probe
+gives rows for tables, and lines or pictures for figures; `style.panels` and `style.gallery` draw
+them in one style.
 """
 
 from __future__ import annotations
@@ -54,16 +56,19 @@ def silent(*progress: object) -> None:
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How much a probe measures; None means the probe's default. ``samples``: most samples of each split, taken evenly
-    over it (`spread`). ``seeds``: repeats of what depends on random numbers. ``quick``: a short run for a first
-    look."""
+    """How much a probe measures; None means the probe's default. ``samples``: most samples of each
+    split, taken evenly over it (`spread`). ``seeds``: repeats of what depends on random numbers.
+    ``quick``: a short run for a first look."""
 
     samples: int | None = None
     seeds: int | None = None
     quick: bool = False
 
-    def choose(self, names: Sequence[str], usual: int | None = None, quick: int | None = None) -> list[str]:
-        """At most ``samples`` of ``names``, by default ``usual``, or ``quick`` of them in a quick run."""
+    def choose(
+        self, names: Sequence[str], usual: int | None = None, quick: int | None = None
+    ) -> list[str]:
+        """At most ``samples`` of ``names``, by default ``usual``, or ``quick`` of them in a quick
+        run."""
         return spread(names, self.samples or (quick if self.quick else usual))
 
 
@@ -80,9 +85,12 @@ def with_interval(value: float | None, interval: Sequence[float] | None = None) 
     return "-" if value is None else f"{value:.3f}{span}"
 
 
-def table_of(title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
-    """The named ``rows``; ``columns``: titles by the keys of what a row shows. Floats have four significant digits; a
-    mapping is a value ``r`` with its ``interval``; a dash stands for None, and where a row lacks a key."""
+def table_of(
+    title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]
+) -> Table:
+    """The named ``rows``; ``columns``: titles by the keys of what a row shows. Floats have four
+    significant digits; a mapping is a value ``r`` with its ``interval``; a dash stands for None,
+    and where a row lacks a key."""
 
     def text(value: Any) -> str:
         if isinstance(value, Mapping):
@@ -107,8 +115,9 @@ class Figure:
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of a probe: ``summary`` in one or two sentences, ``values`` for JSON, with None instead of NaN.
-    ``skipped``: why the probe does not apply to this subject; then the other fields are empty."""
+    """The result of a probe: ``summary`` in one or two sentences, ``values`` for JSON, with None
+    instead of NaN. ``skipped``: why the probe does not apply to this subject; then the other fields
+    are empty."""
 
     summary: str = ""
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -118,8 +127,9 @@ class Finding:
 
 
 class Probe(ABC):
-    """A test of a model. ``version`` goes up when its result for the same model changes. ``without_network``: what a
-    method without a network lacks for this probe, or None. ``asks_subject``: whether the result is about the model."""
+    """A test of a model. ``version`` goes up when its result for the same model changes.
+    ``without_network``: what a method without a network lacks for this probe, or None.
+    ``asks_subject``: whether the result is about the model."""
 
     name: str
     title: str
@@ -135,7 +145,9 @@ class Probe(ABC):
         return f"{subject.name} is a method without a network: {self.without_network}."
 
     @abstractmethod
-    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+    def run(
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress
+    ) -> Finding:
         """Measure ``subject``."""
 
 
@@ -146,8 +158,8 @@ PROBES = {
     "counterfactual": "Counterfactual",
     "theory": "Theory",
 }
-"""The probes in the order of the report, and their classes; each is in the module of its name, which is imported when
-it runs."""
+"""The probes in the order of the report, and their classes; each is in the module of its name,
+which is imported when it runs."""
 
 
 def make_probe(name: str) -> Probe:
@@ -176,22 +188,26 @@ def diagnose(
     progress: Callable[[Probe], Progress],
     command: str = "",
 ) -> list[ProbeResult]:
-    """Run the probes ``probe_names`` and write ``out/index.html`` and ``out/diagnose.json``; all results
-    in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
-    same; those of other probes join the report. ``progress`` is called with a probe before it runs. The report quotes
-    ``command``. Raises `DiagnosisError` if ``out`` holds other files or another process is at it, and errors of probes;
-    earlier findings stay."""
+    """Run the probes ``probe_names`` and write ``out/index.html`` and ``out/diagnose.json``; all
+    results in the report's order. A finding in ``out`` is reused if subject, dataset, settings and
+    the probe's version are the same; those of other probes join the report. ``progress`` is called
+    with a probe before it runs. The report quotes ``command``. Raises `DiagnosisError` if ``out``
+    holds other files or another process is at it, and errors of probes; earlier findings stay."""
     _prepare(out)
     with exclusive(out / LOCK_FILE, out, "writing a report there", DiagnosisError):
         results, nothing = [], cache(lambda: subject.predicts_nothing(dataset))
         shown = [name for name in PROBES if name in probe_names or (out / f"{name}.json").is_file()]
-        for name, probe in zip(shown, [*map(make_probe, shown)], strict=True):  # what is not installed shows now
+        for name, probe in zip(
+            shown, [*map(make_probe, shown)], strict=True
+        ):  # what is not installed shows now
             key = finding_key(probe, subject, dataset, settings)
             if stored := load_finding(out, name, key):
                 results.append(ProbeResult(probe, *stored, reused=True))
             elif name in probe_names:
                 started = perf_counter()
-                if reason := probe.applies_to(subject) or (nothing() if probe.asks_subject else None):
+                if reason := probe.applies_to(subject) or (
+                    nothing() if probe.asks_subject else None
+                ):
                     finding = Finding(skipped=reason)
                 else:
                     finding = probe.run(subject, dataset, settings, progress(probe))
@@ -204,13 +220,20 @@ def diagnose(
             | {key: getattr(one.finding, key) for key in ("summary", "skipped", "values")}
             for one in results
         }
-        content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
+        content = {
+            "format": "fpp-ml-bench diagnosis",
+            "version": FORMAT_VERSION,
+            **context,
+            "findings": findings,
+        }
         write_json(content, out / JSON_FILE)
         write_atomically(out / REPORT_FILE, report_page(context, results))
         return results
 
 
-def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings) -> str:
+def finding_key(
+    probe: Probe, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings
+) -> str:
     """Hash (64 hex digits) of everything that a finding depends on."""
     content = {
         "probe": probe.name,
@@ -224,7 +247,8 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 
 def save_finding(folder: Path, name: str, key: str, finding: Finding, seconds: float) -> None:
-    """Write ``NAME.json`` and its picture ``NAME.png`` into ``folder``. Raises ``ValueError`` for NaN, infinity."""
+    """Write ``NAME.json`` and its picture ``NAME.png`` into ``folder``. Raises ``ValueError`` for
+    NaN, infinity."""
     content, table = asdict(replace(finding, table=None)), finding.table
     if table is not None:
         content["table"] = {"title": str(table.title), "columns": table.titles, "rows": table.texts}
@@ -234,7 +258,8 @@ def save_finding(folder: Path, name: str, key: str, finding: Finding, seconds: f
 
 
 def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
-    """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the same ``key``."""
+    """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the
+    same ``key``."""
     try:
         content = read_json(folder / f"{name}.json", DiagnosisError)
         if content["key"] != key:
@@ -243,7 +268,8 @@ def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | N
         if fields["figure"] is not None:
             table = fields["table"]
             fields["table"] = Table.of(
-                table["title"], [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+                table["title"],
+                [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]],
             )
             fields["figure"] = Figure(**fields["figure"], png=(folder / f"{name}.png").read_bytes())
         return Finding(**fields), float(content["seconds"])
@@ -256,17 +282,26 @@ def _prepare(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
         names = sorted(path.name for path in out.iterdir())
     except OSError as error:
-        raise DiagnosisError(f"{out}: can't be made a folder ({error.strerror}); give another --out") from None
+        raise DiagnosisError(
+            f"{out}: can't be made a folder ({error.strerror}); give another --out"
+        ) from None
     ours = {JSON_FILE, REPORT_FILE, LOCK_FILE, *(f"{name}.json" for name in PROBES)}
     foreign = [name for name in names if name not in ours and not name.endswith((".png", ".tmp"))]
     if foreign:
-        raise DiagnosisError(f"{out}: holds {foreign[0]}, which is no part of a report; give a new or empty folder")
+        raise DiagnosisError(
+            f"{out}: holds {foreign[0]}, which is no part of a report; give a new or empty folder"
+        )
 
 
-def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, command: str) -> dict[str, Any]:
+def _context(
+    subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, command: str
+) -> dict[str, Any]:
     subject_keys = ("name", "title", "sha256", "units", "normalisation", "frames_used", "direction")
     return {
-        "subject": {**{key: getattr(subject, key) for key in subject_keys}, "layers": subject.layer_names},
+        "subject": {
+            **{key: getattr(subject, key) for key in subject_keys},
+            "layers": subject.layer_names,
+        },
         "dataset": {
             "name": dataset.path.resolve().name,
             "fingerprint": dataset.fingerprint,
@@ -275,14 +310,17 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
         },
         "settings": asdict(settings),
         "command": command,
-        "software": {"fpp_ml_bench": __version__, **{name: version(name) for name in _PACKAGES if find_spec(name)}},
+        "software": {
+            "fpp_ml_bench": __version__,
+            **{name: version(name) for name in _PACKAGES if find_spec(name)},
+        },
         "hardware": describe_hardware().to_dict(),
     }
 
 
 def report_page(context: Mapping[str, Any], results: Sequence[ProbeResult]) -> bytes:
-    """The report: a section for each probe; ``context`` is what ``diagnose.json`` says about subject, dataset, settings
-    and machine."""
+    """The report: a section for each probe; ``context`` is what ``diagnose.json`` says about
+    subject, dataset, settings and machine."""
     name = context["subject"]["name"]
     return page(
         "fpp_ml_bench.baselines.diagnostics",

@@ -1,4 +1,5 @@
-"""The model under diagnosis: shipped weights, a weights file, a method without a network, or a user's torch module."""
+"""The model under diagnosis: shipped weights, a weights file, a method without a network, or a
+user's torch module."""
 
 import hashlib
 import json
@@ -29,10 +30,15 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.sequence import Direction
 
-NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}
+NORMALISATION_OF: dict[str, Normalisation] = {
+    "mm": "raw",
+    "m": "global",
+    "normalised": "individual",
+}
 """How a user's module represents depth, by its units."""
 BATCH = 8
-PIXELS_AT_ONCE = BATCH * 224 * 224  # most images in a batch, and most pixels: at 960 px a batch is one image
+PIXELS_AT_ONCE = BATCH * 224 * 224
+"""Most images in a batch, and most pixels: at 960 px a batch is one image."""
 NORMALISED_BACKGROUND = 0.1
 SAMPLES_ASKED = 6  # to find out whether a model predicts anything
 _LEAST_SPREAD = 1e-3  # relative: predictions that differ by less are the same
@@ -42,12 +48,13 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`: mm, or normalised to
-    the sample's own depth range. ``direction``: that of the fringes in ``frames_used``. With ``uses_ground_truth_mask``
-    it expects frames that are 0 outside the object. ``network`` takes the single frame in ``frames_used`` as
-    (B, 1, H, W) in [0, 1] and outputs depth in the representation ``normalisation``. Without a network, it and the
-    following fields are None or empty. ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the
-    same architecture with random weights."""
+    """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`:
+    mm, or normalised to the sample's own depth range. ``direction``: that of the fringes in
+    ``frames_used``. With ``uses_ground_truth_mask`` it expects frames that are 0 outside the
+    object. ``network`` takes the single frame in ``frames_used`` as (B, 1, H, W) in [0, 1] and
+    outputs depth in the representation ``normalisation``. Without a network, it and the following
+    fields are None or empty. ``layer_names``: the layers to probe, in forward order.
+    ``untrained(seed)``: the same architecture with random weights."""
 
     name: str
     title: str
@@ -76,11 +83,13 @@ class Subject:
         return {name: available[name] for name in self.layer_names}
 
     def captured(self, dataset: DatasetFolder, sample: str) -> list[NDArray[np.uint8] | None]:
-        """The frames of ``sample`` that the subject uses, uint8 (H, W), by frame number; None for all others."""
+        """The frames of ``sample`` that the subject uses, uint8 (H, W), by frame number; None for
+        all others."""
         return captured_frames(dataset, self, sample)  # type: ignore[arg-type]  # it has what this asks a method for
 
     def predict(self, frames: Frames) -> Depth:
-        """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape or not finite."""
+        """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape
+        or not finite."""
         depth: Any = np.asarray(self.predict_frames(frames))
         if depth.shape == self.image_size:
             depth = torch.from_numpy(depth.astype(np.float32))
@@ -96,20 +105,29 @@ class Subject:
         return self.units == "normalised"
 
     def predicts_nothing(self, dataset: DatasetFolder) -> str | None:
-        """How the subject predicts nothing for `SAMPLES_ASKED` samples of all splits: background, or the same value, on
-        all object pixels but stray ones. None for a subject that predicts something."""
+        """How the subject predicts nothing for `SAMPLES_ASKED` samples of all splits: background,
+        or the same value, on all object pixels but stray ones. None for a subject that predicts
+        something."""
         samples = spread(dataset.samples("all"), SAMPLES_ASKED)
-        answers = [self.predict(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples]
+        answers = [
+            self.predict(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))]
+            for name in samples
+        ]
         values = np.concatenate(answers)
         if not values.size:
             return None
         low, high = np.quantile(values, (_STRAY, 1 - _STRAY))
         what = f"{low:.4g}{' of the depth range' if self.answers_normalised else ' mm'}"
-        if max(-low, high) < background_below(self.answers_normalised, dataset.rig.working_range_mm[0]):
+        if max(-low, high) < background_below(
+            self.answers_normalised, dataset.rig.working_range_mm[0]
+        ):
             what = "background"
         elif high - low > _LEAST_SPREAD * abs(high):
             return None
-        return f"{self.name} predicts nothing but {what} on the object pixels of {len(samples)} samples."
+        return (
+            f"{self.name} predicts nothing but {what} on the object pixels of {len(samples)} "
+            f"samples."
+        )
 
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
         """Input of ``network``, float32 (B, 1, H, W) in [0, 1]."""
@@ -119,28 +137,33 @@ class Subject:
     def batches(
         self, dataset: DatasetFolder, samples: Sequence[str], size: int | None = None
     ) -> Iterator[tuple[list[str], Tensor]]:
-        """``samples`` in batches of ``size`` (default: so that memory stays bounded), with their input (B, 1, H, W)."""
-        size = size or max(1, min(BATCH, PIXELS_AT_ONCE // (self.image_size[0] * self.image_size[1])))
+        """``samples`` in batches of ``size`` (default: so that memory stays bounded), with their
+        input (B, 1, H, W)."""
+        size = size or max(
+            1, min(BATCH, PIXELS_AT_ONCE // (self.image_size[0] * self.image_size[1]))
+        )
         for start in range(0, len(samples), size):
             names = list(samples[start : start + size])
             yield names, self.input_batch([self.captured(dataset, name) for name in names])
 
 
 def background_below(normalised: bool, near_mm: float) -> float:
-    """Predictions below it, normalised or in mm, are nearer to background than to any object, of which none is nearer
-    than ``near_mm``."""
+    """Predictions below it, normalised or in mm, are nearer to background than to any object, of
+    which none is nearer than ``near_mm``."""
     return NORMALISED_BACKGROUND if normalised else near_mm / 2
 
 
 def network_output(network: nn.Module, batch: Tensor, name: str) -> Depth:
-    """What ``network`` makes of the first image of ``batch``, float32 (H, W). Raises `DiagnosisError` for a network
-    that fails, and as `checked_output`."""
+    """What ``network`` makes of the first image of ``batch``, float32 (H, W). Raises
+    `DiagnosisError` for a network that fails, and as `checked_output`."""
     try:
         with torch.inference_mode():
             output = network(batch)
     except Exception as error:  # the user's code can raise anything
         reason = f"{type(error).__name__}: {printable(str(error), 400)}"
-        raise DiagnosisError(f"{name}: on fringes of shape {tuple(batch.shape)} it failed: {reason}") from error
+        raise DiagnosisError(
+            f"{name}: on fringes of shape {tuple(batch.shape)} it failed: {reason}"
+        ) from error
     return checked_output(output, batch.shape, name)[0, 0].numpy()
 
 
@@ -149,25 +172,35 @@ def checked_output(output: Tensor, shape: Sequence[int], name: str) -> Tensor:
     found, expected = tuple(getattr(output, "shape", ())), tuple(shape)
     if found != expected:
         got = found or type(output).__name__
-        raise DiagnosisError(f"{name}: expected an output of shape {expected}, one depth per pixel, got {got}")
+        raise DiagnosisError(
+            f"{name}: expected an output of shape {expected}, one depth per pixel, got {got}"
+        )
     if not_finite := int((~output.isfinite()).sum()):
-        raise DiagnosisError(f"{name}: {not_finite} of {output.numel()} values of its output are NaN or infinite")
+        raise DiagnosisError(
+            f"{name}: {not_finite} of {output.numel()} values of its output are NaN or infinite"
+        )
     return output.float()
 
 
 def activations_of(
-    network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor, reduce: Callable[[Tensor], Tensor], name: str
+    network: nn.Module,
+    layers: dict[str, nn.Module],
+    fringe: Tensor,
+    reduce: Callable[[Tensor], Tensor],
+    name: str,
 ) -> dict[str, Tensor]:
-    """``reduce(activations)`` of every layer by its name, of one forward pass of the network called ``name``.
-    ``reduce`` is called before a later layer can change the output in place. Its result must not be a view of the
-    output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or that the pass does not reach, and
-    for an output that is not a depth map."""
+    """``reduce(activations)`` of every layer by its name, of one forward pass of the network called
+    ``name``. ``reduce`` is called before a later layer can change the output in place. Its result
+    must not be a view of the output. Raises `DiagnosisError` for a layer whose output is not (B, C,
+    h, w) or that the pass does not reach, and for an output that is not a depth map."""
     activations: dict[str, Tensor] = {}
 
     def record(layer: str, module: nn.Module, inputs: object, output: object) -> None:
         if not isinstance(output, Tensor) or output.dim() != 4:
             shape = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
-            raise DiagnosisError(f"layer {layer!r}: expected activations (B, C, h, w), got {shape}; leave it out")
+            raise DiagnosisError(
+                f"layer {layer!r}: expected activations (B, C, h, w), got {shape}; leave it out"
+            )
         activations[layer] = reduce(output.float())
 
     with ExitStack() as hooks, torch.no_grad():
@@ -176,7 +209,9 @@ def activations_of(
         checked_output(network(fringe), fringe.shape, name)
     for layer in layers:
         if layer not in activations:
-            raise DiagnosisError(f"{name}: layer {layer!r} takes no part in a forward pass; leave it out")
+            raise DiagnosisError(
+                f"{name}: layer {layer!r} takes no part in a forward pass; leave it out"
+            )
     return activations
 
 
@@ -190,21 +225,29 @@ def subject(
     options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Subject:
     """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
-    `fpp_ml_bench.baselines.registry`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
-    ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
-    (of `NORMALISATION_OF`; default: normalised). ``layers``: names of the layers to probe, by default the network's
-    ``probe_layers``, or every child of a module without them. ``frame``: number of the network's input frame, by
-    default the first that it was trained on. ``threads``: torch threads of the process. ``options``: those of a method.
-    Raises `DiagnosisError` for a name, layer or module that can't be used, and other `FppBenchError` of the model."""
+    `fpp_ml_bench.baselines.registry`, shipped weights, a ``.safetensors`` file, or
+    ``file.py:factory``, where ``factory()`` returns a torch module that maps fringes (B, 1, H, W)
+    in [0, 1] to depth (B, 1, H, W) in ``units`` (of `NORMALISATION_OF`; default: normalised).
+    ``layers``: names of the layers to probe, by default the network's ``probe_layers``, or every
+    child of a module without them. ``frame``: number of the network's input frame, by default the
+    first that it was trained on. ``threads``: torch threads of the process. ``options``: those of a
+    method. Raises `DiagnosisError` for a name, layer or module that can't be used, and other
+    `FppBenchError` of the model."""
     made = load_from_file(name) if FILE_MARK in name else Method
     if not (isinstance(made, type) and issubclass(made, Method)):
         torch.set_num_threads(threads)
         return _subject_of_factory(name, made, dataset, layers, units or "normalised", frame or 0)
     if units is not None:
-        raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
+        raise DiagnosisError(
+            f"{name}: its units are known; set units only for your own module, file.py:factory"
+        )
     if not issubclass(find(name).method, NetworkMethod):
-        if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
-            raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
+        if given := [
+            option for option, value in (("layers", layers), ("frame", frame)) if value is not None
+        ]:
+            raise DiagnosisError(
+                f"{name} is a method without a network, so it has no {given[0]}; leave it out"
+            )
         return subject_of_method(load_method(name, dataset, **options), dataset)
     torch.set_num_threads(threads)
     method: Any = load_method(name, dataset, frame=frame, threads=threads, device="cpu")
@@ -250,31 +293,44 @@ def _layers(network: nn.Module) -> dict[str, nn.Module]:
     return {**own, **named} if isinstance(own, dict) else named
 
 
-def _select_layers(requested: Sequence[str] | None, network: nn.Module, name: str) -> tuple[str, ...]:
-    """The ``requested`` layers in forward order, by default the network's ``probe_layers``, or every child of one
-    without them. Raises `DiagnosisError` for unknown ones."""
+def _select_layers(
+    requested: Sequence[str] | None, network: nn.Module, name: str
+) -> tuple[str, ...]:
+    """The ``requested`` layers in forward order, by default the network's ``probe_layers``, or
+    every child of one without them. Raises `DiagnosisError` for unknown ones."""
     available = _layers(network)
     for layer in requested or ():
         if layer not in available:
             suggestions = get_close_matches(layer, available, n=3) or list(available)[:12]
-            raise DiagnosisError(f"{name} has no layer {layer!r}; there are {', '.join(suggestions)}")
+            raise DiagnosisError(
+                f"{name} has no layer {layer!r}; there are {', '.join(suggestions)}"
+            )
     usual = getattr(network, "probe_layers", None) or dict(network.named_children())
     return tuple(layer for layer in available if layer in (requested or usual))
 
 
 def _direction_of(dataset: DatasetFolder, frames: Sequence[int]) -> Direction | Literal["both"]:
     """Fringe direction of ``frames``; ``both`` where they differ or have no direction."""
-    first, *others = {dataset.sequence.frames[index].direction for index in frames} - {None} or {None}
+    first, *others = {dataset.sequence.frames[index].direction for index in frames} - {None} or {
+        None
+    }
     return "both" if first is None or others else first
 
 
 def _subject_of_factory(
-    name: str, factory: Any, dataset: DatasetFolder, layers: Sequence[str] | None, units: str, frame: int
+    name: str,
+    factory: Any,
+    dataset: DatasetFolder,
+    layers: Sequence[str] | None,
+    units: str,
+    frame: int,
 ) -> Subject:
-    """The module that ``factory`` of ``file.py:factory`` makes, as a subject. It is run on a sample, so that misfits
-    show early."""
+    """The module that ``factory`` of ``file.py:factory`` makes, as a subject. It is run on a
+    sample, so that misfits show early."""
     if not 0 <= frame < len(dataset.sequence):
-        raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
+        raise DiagnosisError(
+            f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence"
+        )
     network = _build_network(name, factory)
     path, normalisation = Path(name.rpartition(":")[0]), NORMALISATION_OF[units]
     digest = hashlib.sha256(f"{units} {frame} {code_in(path.resolve())}".encode())
@@ -309,8 +365,8 @@ def _subject_of_factory(
 
 
 def randomised(network: nn.Module, seed: int) -> nn.Module:
-    """``network`` with random weights, changed in place: layers with ``reset_parameters`` are initialised again, the
-    parameters of the others are shuffled, which keeps their scale."""
+    """``network`` with random weights, changed in place: layers with ``reset_parameters`` are
+    initialised again, the parameters of the others are shuffled, which keeps their scale."""
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
         for module in network.modules():
@@ -331,8 +387,11 @@ def _build_network(name: str, factory: Any) -> nn.Module:
             network = factory()
     except (Exception, SystemExit) as error:
         raise DiagnosisError(
-            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
+            f"{name}: calling it without arguments failed: {type(error).__name__}: "
+            f"{printable(str(error), 400)}"
         ) from error
     if not isinstance(network, nn.Module):
-        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
+        raise DiagnosisError(
+            f"{name}: expected it to return a torch module, got {type(network).__name__}"
+        )
     return network.eval().requires_grad_(False).cpu()

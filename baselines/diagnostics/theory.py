@@ -1,9 +1,11 @@
-"""The paper's two theorems (Section 4.2), checked numerically (docs/phase_and_order.md); the subject is not used.
+"""The paper's two theorems (Section 4.2), checked numerically (docs/phase_and_order.md); the
+subject is not used.
 
-*A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same frame of that
-direction, noise included, if at each pixel the brighter one gets a lower albedo (in direct light from a projector in
-focus at both: its blur would be a hint). *An error of one period costs Z^2*,
-and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b).
+*A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same
+frame of that direction, noise included, if at each pixel the brighter one gets a lower albedo (in
+direct light from a projector in focus at both: its blur would be a hint). *An error of one period
+costs Z^2*, and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with
+kappa = P / (f_p b).
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +40,8 @@ SHOWN_M = 1.8  # in the summary
 SMALL_PERIODS = 1 / 64  # an error so small that the linear model holds over all distances
 ERRORS_PERIODS = {"1/64 period": SMALL_PERIODS, "a period, away": 1.0, "a period, toward": -1.0}
 STARTS_PERIODS = (0.0, -1.0, -0.5)
-"""Position of the first of two scenes that are a period apart, in periods from the object's own position."""
+"""Position of the first of two scenes that are a period apart, in periods from the object's own
+position."""
 _STEP = 1e-4  # relative step of distance in a difference quotient
 
 
@@ -49,9 +52,18 @@ class Theory(Probe):
     title = "Theory in numbers"
     asks_subject = False
     version = 2
-    question = "Can two depths give the same fringe, and how large is the depth error of one period at each distance?"
+    question = (
+        "Can two depths give the same fringe, and how large is the depth error of one period at "
+        "each distance?"
+    )
 
-    def run(self, subject: "Subject", dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+    def run(
+        self,
+        subject: "Subject",
+        dataset: DatasetFolder,
+        settings: ProbeSettings,
+        progress: Progress,
+    ) -> Finding:
         progress(0, 2, "two scenes, one frame")
         twins = twins_of(dataset, SceneRenderer.of(dataset))
         progress(1, 2, "one period, many distances")
@@ -66,15 +78,25 @@ class Theory(Probe):
             for distance_m in DISTANCES_M
         ]
         facts = twins.to_dict()
-        small, away, toward = (with_interval(row["exponent"]) for row in laws if row["distance_m"] == SHOWN_M)
+        small, away, toward = (
+            with_interval(row["exponent"]) for row in laws if row["distance_m"] == SHOWN_M
+        )
         summary = (
-            f"{twins.sample} and a surface {facts['depth_apart_mean_mm']:.0f} mm from it on average give the same "
-            f"{twins.direction} fringe: {facts['differing_pixels']} of the image's pixels differ (the frame of the "
-            f"other direction: {facts['differing_pixels_other_direction']}). At {SHOWN_M:g} m the depth error of a "
-            f"small phase error grows with exponent {small} of distance, that of a whole period with {away} away from "
+            f"{twins.sample} and a surface {facts['depth_apart_mean_mm']:.0f} mm from it on "
+            f"average give the same "
+            f"{twins.direction} fringe: {facts['differing_pixels']} of the image's pixels differ "
+            f"(the frame of the "
+            f"other direction: {facts['differing_pixels_other_direction']}). At {SHOWN_M:g} m the "
+            f"depth error of a "
+            f"small phase error grows with exponent {small} of distance, that of a whole period "
+            f"with {away} away from "
             f"the camera and {toward} toward it."
         )
-        values = {"twins": facts, "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "laws": laws}
+        values = {
+            "twins": facts,
+            "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
+            "laws": laws,
+        }
         rows = {f"{row['error']}, {row['distance_m']:g} m": row for row in laws}
         columns = {"error_mm": "Depth error, mm", "exponent": "Local exponent of distance"}
         table = table_of("Depth error of a phase error by distance", "Phase error", rows, columns)
@@ -83,8 +105,9 @@ class Theory(Probe):
 
 @dataclass(frozen=True)
 class Twins:
-    """Two scenes that a frame can't tell apart: ``depths_mm`` float64 (2, H, W), 0 outside the object; ``frames`` and
-    ``other_frames``, of the other direction, uint8 (2, H, W), by their numbers ``frame`` and ``other_frame``."""
+    """Two scenes that a frame can't tell apart: ``depths_mm`` float64 (2, H, W), 0 outside the
+    object; ``frames`` and ``other_frames``, of the other direction, uint8 (2, H, W), by their
+    numbers ``frame`` and ``other_frame``."""
 
     sample: str
     direction: Direction
@@ -109,23 +132,38 @@ class Twins:
         }
 
 
-def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Direction = "horizontal") -> Twins:
-    """The first test object that fits into the working range twice, a whole period apart: at its own position and a
-    period away, or half a period to either side. Raises `DiagnosisError` where there is none."""
+def twins_of(
+    dataset: DatasetFolder, renderer: SceneRenderer, direction: Direction = "horizontal"
+) -> Twins:
+    """The first test object that fits into the working range twice, a whole period apart: at its
+    own position and a period away, or half a period to either side. Raises `DiagnosisError` where
+    there is none."""
     rig = renderer.rig
     near_m, far_m = (end / MM_PER_M for end in rig.working_range_mm)
     in_focus = SceneRenderer(rig, renderer.lamp.changed("projector", defocus_px=0.0))
     sinusoids = rig.sequence.sinusoids
-    frame, across = sinusoids(direction)[0], sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
+    frame, across = (
+        sinusoids(direction)[0],
+        sinusoids("vertical" if direction == "horizontal" else "horizontal")[0],
+    )
     for sample in dataset.samples("test"):
         first = original(dataset, renderer, sample)
         for start in STARTS_PERIODS if first.mask.any() else ():
-            pair = [moved(first.surface, rig, direction, constant, TAU * turns) for turns in (start, start + 1)]
-            if not all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
+            pair = [
+                moved(first.surface, rig, direction, constant, TAU * turns)
+                for turns in (start, start + 1)
+            ]
+            if not all(
+                near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m
+                for surface in pair
+            ):
                 continue
             lights = [in_focus.light(surface) for surface in pair]
             # Albedo can only be lowered, so at each pixel it is lowered on the brighter surface.
-            least, most = (of(*(light.gain.astype(np.float64) for light in lights)) for of in (np.minimum, np.maximum))
+            least, most = (
+                of(*(light.gain.astype(np.float64) for light in lights))
+                for of in (np.minimum, np.maximum)
+            )
             paint = np.divide(least, most, out=np.ones_like(most), where=most > 0)
             scenes = [
                 replace(first, surface=surface, lit=replace(light, gain=least.astype(np.float32)))
@@ -149,12 +187,15 @@ def _axis(rig: Rig, direction: Direction) -> CalibrationLayer:
 
 
 def kappa_per_m(rig: Rig, direction: Direction) -> float:
-    """P / (f_p b) on the camera's axis in 1 / m: a period relative to the disparity, per metre of distance."""
+    """P / (f_p b) on the camera's axis in 1 / m: a period relative to the disparity, per metre of
+    distance."""
     layer = _axis(rig, direction)
     return float(TAU / abs(layer.gain[0]) * layer.forward[0])
 
 
-def depth_error_mm(rig: Rig, direction: Direction, distance_m: float, periods: float) -> float | None:
+def depth_error_mm(
+    rig: Rig, direction: Direction, distance_m: float, periods: float
+) -> float | None:
     """|depth of the wrong phase - depth| on the camera's axis, in mm; None where no point ahead has the wrong phase."""
     layer, true_mm = _axis(rig, direction), distance_m * MM_PER_M
     residual = layer.residual_of_depth(np.array([true_mm]))
@@ -166,7 +207,10 @@ def depth_error_mm(rig: Rig, direction: Direction, distance_m: float, periods: f
 
 def exponent(rig: Rig, direction: Direction, distance_m: float, periods: float) -> float | None:
     """d log `depth_error_mm` / d log distance; None where there is no depth."""
-    low, high = (depth_error_mm(rig, direction, distance_m * factor, periods) for factor in (1 - _STEP, 1 + _STEP))
+    low, high = (
+        depth_error_mm(rig, direction, distance_m * factor, periods)
+        for factor in (1 - _STEP, 1 + _STEP)
+    )
     return float(np.log(high / low) / np.log((1 + _STEP) / (1 - _STEP))) if low and high else None
 
 
@@ -179,7 +223,8 @@ def _draw_twins(twins: Twins) -> Figure:
         for name, pair in pairs.items()
     }
     rows[f"depth,\n{low:.0f} to {high:.0f} mm"] = [
-        Picture(np.where(inside, depth, np.nan), DEPTH_COLOURS, low, high) for depth in twins.depths_mm
+        Picture(np.where(inside, depth, np.nan), DEPTH_COLOURS, low, high)
+        for depth in twins.depths_mm
     ]
     alt = "Two depths a period apart and their identical fringes"
     return Figure("Two scenes, one frame", alt, gallery(rows, ("scene A", "scene B"), 2.2))

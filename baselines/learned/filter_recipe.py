@@ -1,5 +1,5 @@
-"""Training classical-net: the decoded scene of each view with the exact depth, windows of them, and what is chosen on
-validation views."""
+"""Training classical-net: the decoded scene of each view with the exact depth, windows of them, and
+what is chosen on validation views."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -32,20 +32,26 @@ from fpp_ml_bench.optics.sequence import Direction
 SMALL_UNITS = 0.1  # error below which its loss is quadratic, in the scene's median sigma
 LARGEST_UNITS = 30.0  # at which an error is clipped: a wrong order can't be averaged away
 THRESHOLDS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1e3)
-"""Logits from which on a pixel without a depth is filled, tried on the validation views; the last fills none."""
+"""Logits from which on a pixel without a depth is filled, tried on the validation views; the last
+fills none."""
 ORIENTATIONS = 8
 STRIDES, STRIDE_SHARES = (1, 2, 4), (0.6, 0.25, 0.15)
-"""Every so many-th pixel of a view makes a window, and how often: a coarser camera sees steeper, more bent surfaces."""
+"""Every so many-th pixel of a view makes a window, and how often: a coarser camera sees steeper,
+more bent surfaces."""
 
 
 def depth_sample(view: View, method: ClassicalMethod) -> Sample | None:
-    """The sample of a view, decoded by ``method``; None where nothing was decoded. What is missing: exact depth less
-    the scene's ``middle_mm``. Pixels without a depth are of interest too."""
+    """The sample of a view, decoded by ``method``; None where nothing was decoded. What is missing:
+    exact depth less the scene's ``middle_mm``. Pixels without a depth are of interest too."""
     frames: list[NDArray[np.uint8] | None] = [None] * len(method.rig.sequence)
     for index, frame in zip(method.frames_used, view.frames, strict=True):
         frames[index] = frame
     answer, modulation = method.measure(frames)
-    scene = None if answer.sigma_mm is None else DepthScene.of(answer.depth, answer.sigma_mm, modulation)
+    scene = (
+        None
+        if answer.sigma_mm is None
+        else DepthScene.of(answer.depth, answer.sigma_mm, modulation)
+    )
     if scene is None:
         return None
     part = view.part(scene.crop)
@@ -55,8 +61,9 @@ def depth_sample(view: View, method: ClassicalMethod) -> Sample | None:
 
 @dataclass(frozen=True)
 class FilterRecipe(StepRecipe):
-    """``phase_steps`` of one ``direction``, with Gray code; ``widths`` of the network; ``near_edge``: share of windows
-    beside depth edges and missing pixels; ``weight_*``: of the losses."""
+    """``phase_steps`` of one ``direction``, with Gray code; ``widths`` of the network;
+    ``near_edge``: share of windows beside depth edges and missing pixels; ``weight_*``: of the
+    losses."""
 
     name: str = "classical-net"
     steps: int = 2000
@@ -76,20 +83,28 @@ class FilterRecipe(StepRecipe):
     main_loss: ClassVar[str] = "depth"
     scores: ClassVar[dict[str, dict[str, str]]] = {
         "validation MAE, mm": {"object_mae_mm": "filtered", "input_mae_mm": "decoded"},
-        "validation, % of object pixels": {"missed_percent": "missed", "input_missed_percent": "missed before"},
+        "validation, % of object pixels": {
+            "missed_percent": "missed",
+            "input_missed_percent": "missed before",
+        },
     }
 
     def network(self) -> DepthFilter:
         return DepthFilter(len(DEPTH_CHANNELS), self.widths)
 
     def losses(self, network: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """``depth``: smooth L1 in the scene's median sigma; ``mask``: binary cross-entropy of pixels without a depth;
-        ``scale``: negative log-likelihood of the depth's error under a Laplace distribution."""
-        depth, inside, scale, near = network(batch["x"], batch["depth_mm"], batch["sigma_mm"], batch["found"])
+        """``depth``: smooth L1 in the scene's median sigma; ``mask``: binary cross-entropy of
+        pixels without a depth; ``scale``: negative log-likelihood of the depth's error under a
+        Laplace distribution."""
+        depth, inside, scale, near = network(
+            batch["x"], batch["depth_mm"], batch["sigma_mm"], batch["found"]
+        )
         unit = batch["unit_mm"][:, None, None]
         counted = batch["target"] & near
         error = ((depth - batch["exact_mm"]) / unit).clamp(-LARGEST_UNITS, LARGEST_UNITS)
-        by_pixel = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=SMALL_UNITS, reduction="none")
+        by_pixel = functional.smooth_l1_loss(
+            error, torch.zeros_like(error), beta=SMALL_UNITS, reduction="none"
+        )
         return {
             "depth": mean_over(by_pixel, counted),
             "mask": mask_loss(inside, batch["target"], near & ~batch["found"] & batch["valid"]),
@@ -104,18 +119,24 @@ class FilterTask(Task):
     """What classical-net learns: the frames of a decoded depth."""
 
     def __init__(self, recipe: FilterRecipe, rig: Rig) -> None:
-        self.recipe, self.method = recipe, ClassicalMethod(rig, direction=recipe.direction, steps=recipe.phase_steps)
+        self.recipe, self.method = (
+            recipe,
+            ClassicalMethod(rig, direction=recipe.direction, steps=recipe.phase_steps),
+        )
         self.frames = self.method.frames_used
 
     def samples(self, views: Iterable[View]) -> list[Sample]:
         return [sample for view in views if (sample := depth_sample(view, self.method)) is not None]
 
     def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:
-        """A random window of one of ``samples``, of one of `STRIDES`, in one of 8 orientations: the maps of its scene
-        that the network takes; ``exact_mm``, ``target``, and ``valid``: neither void nor padding; ``unit_mm``: median
-        sigma of the scene, the unit of the errors."""
+        """A random window of one of ``samples``, of one of `STRIDES`, in one of 8 orientations: the
+        maps of its scene that the network takes; ``exact_mm``, ``target``, and ``valid``: neither
+        void nor padding; ``unit_mm``: median sigma of the scene, the unit of the errors."""
         size, sample = self.recipe.window, samples[random.integers(len(samples))]
-        orientation, every = int(random.integers(ORIENTATIONS)), int(random.choice(STRIDES, p=STRIDE_SHARES))
+        orientation, every = (
+            int(random.integers(ORIENTATIONS)),
+            int(random.choice(STRIDES, p=STRIDE_SHARES)),
+        )
         rows, columns = sample.place(size * every, self.recipe.near_edge, random)
 
         def cut(name: str, maps: NDArray) -> NDArray:
@@ -133,7 +154,9 @@ class FilterTask(Task):
         }
 
     def scores(self, network: DepthFilter, samples: list[Sample]) -> dict[str, float]:
-        return mean_scores(filter_scores(filtered(network, sample.scene), sample, 0.0) for sample in samples)
+        return mean_scores(
+            filter_scores(filtered(network, sample.scene), sample, 0.0) for sample in samples
+        )
 
     def chosen(
         self, network: DepthFilter, samples: list[Sample], validation: list[Sample], out: Path
@@ -147,8 +170,9 @@ class FilterTask(Task):
 
 
 def filter_scores(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float | None]:
-    """`view_scores` of a view, filtered and, as ``input_*``, as decoded; ``invented_kpx`` counts what the filter added.
-    ``within_percent``: share of errors within the stated standard uncertainty."""
+    """`view_scores` of a view, filtered and, as ``input_*``, as decoded; ``invented_kpx`` counts
+    what the filter added. ``within_percent``: share of errors within the stated standard
+    uncertainty."""
     scene, target = sample.scene, sample.target
     if not target.any():
         return {}
@@ -167,10 +191,13 @@ def filter_scores(answer: Filtered, sample: Sample, threshold: float) -> dict[st
 
 
 def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[Sample]) -> float:
-    """The lowest of `THRESHOLDS` at which no validation view loses: what filling saves on the object is at least what
-    it adds on the background, each pixel counted with its whole depth."""
+    """The lowest of `THRESHOLDS` at which no validation view loses: what filling saves on the
+    object is at least what it adds on the background, each pixel counted with its whole depth."""
     for threshold in THRESHOLDS:
-        if all(_gain_px(answer, sample, threshold) >= 0 for answer, sample in zip(answers, samples, strict=True)):
+        if all(
+            _gain_px(answer, sample, threshold) >= 0
+            for answer, sample in zip(answers, samples, strict=True)
+        ):
             return threshold
     return THRESHOLDS[-1]
 

@@ -1,8 +1,10 @@
-"""fringe-net: networks that give the numerator M and denominator D of a fringe's wrapped phase, atan2(M, D), from one
-image (Feng et al. 2019), in the place of the local fit. Mask, order and depth are those of the measured routes.
+"""fringe-net: networks that give the numerator M and denominator D of a fringe's wrapped phase,
+atan2(M, D), from one image (Feng et al. 2019), in the place of the local fit. Mask, order and depth
+are those of the measured routes.
 
-An ensemble of networks answers with the sum of its members' (D, M). Its uncertainty is the mean of the variances that
-the members state and the variance between their phases (Lakshminarayanan et al. 2017).
+An ensemble of networks answers with the sum of its members' (D, M). Its uncertainty is the mean of
+the variances that the members state and the variance between their phases (Lakshminarayanan et al.
+2017).
 """
 
 from collections.abc import Sequence
@@ -23,7 +25,8 @@ from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Observation
 from fpp_ml_bench.baselines.phase.order import FringeOrder
 from fpp_ml_bench.constants import GREY_LEVELS
 
-WINDOW_PERIODS = 0.6  # sigma of the Gaussian over which mean and spread of the grey levels are taken
+WINDOW_PERIODS = 0.6
+"""Sigma of the Gaussian over which mean and spread of the grey levels are taken."""
 LEAST_SPREAD_GREY = 1.0
 FURTHEST = 4.0  # spreads at which grey levels are clipped
 FRINGE_CHANNELS = "grey level", "against its surroundings"
@@ -31,8 +34,8 @@ FRINGE_CHANNELS = "grey level", "against its surroundings"
 
 @dataclass(frozen=True)
 class FringeScene(CroppedMaps):
-    """The part ``crop`` of an image, grey levels (h, w): ``grey``, and ``mean`` and ``spread``, standard deviation,
-    around each pixel."""
+    """The part ``crop`` of an image, grey levels (h, w): ``grey``, and ``mean`` and ``spread``,
+    standard deviation, around each pixel."""
 
     grey: Image
     mean: Image
@@ -41,7 +44,9 @@ class FringeScene(CroppedMaps):
     @classmethod
     def of(cls, grey: Image, period_px: float, crop: Crop) -> "FringeScene":
         """Of a part ``grey`` float32 (h, w) of an image whose longest fringe has ``period_px``."""
-        mean, power = (cv2.GaussianBlur(one, (0, 0), WINDOW_PERIODS * period_px) for one in (grey, grey * grey))
+        mean, power = (
+            cv2.GaussianBlur(one, (0, 0), WINDOW_PERIODS * period_px) for one in (grey, grey * grey)
+        )
         spread = np.sqrt(np.maximum(power - mean * mean, LEAST_SPREAD_GREY**2))
         return cls(crop, grey, np.asarray(mean, np.float32), np.asarray(spread, np.float32))
 
@@ -59,7 +64,8 @@ def fringe_channels(scene: FringeScene) -> Image:
 
 @dataclass(frozen=True)
 class Phases:
-    """Of K carriers: ``phase_rad`` in [-pi, pi] and ``sigma_rad``, its standard uncertainty, float32 (K, h, w)."""
+    """Of K carriers: ``phase_rad`` in [-pi, pi] and ``sigma_rad``, its standard uncertainty,
+    float32 (K, h, w)."""
 
     phase_rad: Image
     sigma_rad: Image
@@ -71,18 +77,22 @@ def phases_of(networks: Sequence[FringeNet], x: Image) -> Phases:
     total = np.sum(answers, axis=0)
     count = len(total) // 3
     phase = np.arctan2(total[:count], total[count : 2 * count])
-    variance: NDArray = np.mean([(SCALE_TO_SIGMA * np.exp(one[2 * count :])) ** 2 for one in answers], axis=0)
+    variance: NDArray = np.mean(
+        [(SCALE_TO_SIGMA * np.exp(one[2 * count :])) ** 2 for one in answers], axis=0
+    )
     if len(answers) > 1:
-        apart = [wrapped(np.arctan2(one[:count], one[count : 2 * count]) - phase) for one in answers]
+        apart = [
+            wrapped(np.arctan2(one[:count], one[count : 2 * count]) - phase) for one in answers
+        ]
         variance = variance + np.sum(np.square(apart), axis=0) / (len(answers) - 1)
     return Phases(phase.astype(np.float32), np.sqrt(variance).astype(np.float32))
 
 
 @dataclass(frozen=True)
 class FringePhase:
-    """The phase of fringes of one direction by networks, for which they are turned so that phase grows downwards. The
-    order is that of the local fit: with the exact phase larger parts hang together, and all of a part is wrong where a
-    texture misleads it."""
+    """The phase of fringes of one direction by networks, for which they are turned so that phase
+    grows downwards. The order is that of the local fit: with the exact phase larger parts hang
+    together, and all of a part is wrong where a texture misleads it."""
 
     geometry: Geometry
     networks: Sequence[FringeNet]
@@ -92,7 +102,10 @@ class FringePhase:
         rotation = self.geometry.rotation
         x = fringe_channels(FringeScene.of(seen.greys[0], self.geometry.period_px, seen.crop))
         turned = phases_of(self.networks, np.ascontiguousarray(rotation.turn(x)))
-        phase, sigma = (np.ascontiguousarray(rotation.back(maps)) for maps in (turned.phase_rad, turned.sigma_rad))
+        phase, sigma = (
+            np.ascontiguousarray(rotation.back(maps))
+            for maps in (turned.phase_rad, turned.sigma_rad)
+        )
         return Phases(np.float32(rotation.sign) * phase, sigma)
 
     def __call__(self, chosen: FringeOrder) -> FringeOrder:
@@ -102,26 +115,33 @@ class FringePhase:
         found = self.phases(seen)
         phase, sigma = found.phase_rad[0], np.float32(EXPECTED_SHARE) * found.sigma_rad[0]
         order = chosen.order + np.rint((seen.phase_rad - phase) / TAU).astype(np.int32)
-        return FringeOrder(replace(seen, phase_rad=phase, uncertainty_rad=sigma), order, chosen.margin)
+        return FringeOrder(
+            replace(seen, phase_rad=phase, uncertainty_rad=sigma), order, chosen.margin
+        )
 
 
 @dataclass(frozen=True)
 class CrossedPhases:
-    """The phases of both carriers of one crossed frame by networks, of the rig that they learned from: first for the
-    choice of the order (`before`), then for the nearness of every pixel (`after`)."""
+    """The phases of both carriers of one crossed frame by networks, of the rig that they learned
+    from: first for the choice of the order (`before`), then for the nearness of every pixel
+    (`after`)."""
 
     period_px: float
     networks: Sequence[FringeNet]
 
     def phases(self, seen: CrossedObservation) -> Phases:
         """Of both carriers."""
-        return phases_of(self.networks, fringe_channels(FringeScene.of(seen.grey, self.period_px, seen.crop)))
+        return phases_of(
+            self.networks, fringe_channels(FringeScene.of(seen.grey, self.period_px, seen.crop))
+        )
 
     def before(self, seen: CrossedObservation) -> CrossedObservation:
         """The observation with these phases."""
         found = self.phases(seen)
         points = found.phase_rad[:, :: seen.stride, :: seen.stride]
-        return replace(seen, phase_rad=found.phase_rad, point_phase_rad=points, sigma_rad=found.sigma_rad)
+        return replace(
+            seen, phase_rad=found.phase_rad, point_phase_rad=points, sigma_rad=found.sigma_rad
+        )
 
     @staticmethod
     def after(fitted: Fitted) -> Fitted:
@@ -137,7 +157,9 @@ def _nearness_fit(seen: CrossedObservation, fit: NearnessFit, sigma_rad: Image) 
     carriers = seen.carriers
     beside = wrapped(seen.phase_rad - carriers.phases(fit.nearness))
     nearness = fit.nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2
-    misfit = seen.light - np.maximum(fit.brightness, 0) * fringes(carriers, nearness, seen.contrast)[0]
+    misfit = (
+        seen.light - np.maximum(fit.brightness, 0) * fringes(carriers, nearness, seen.contrast)[0]
+    )
     uncertainty = np.hypot(*(carriers.gain * sigma_rad)) / carriers.joint_gain
     maps = (nearness, fit.brightness, misfit, fit.weight, uncertainty)
     return NearnessFit(*(np.asarray(values, np.float32) for values in maps))

@@ -1,8 +1,9 @@
-"""Training fringe-net: one image of each view with the numerator and denominator of its wrapped phase, and windows of
-them.
+"""Training fringe-net: one image of each view with the numerator and denominator of its wrapped
+phase, and windows of them.
 
-Fringes of one direction learn from the 18 steps of the same view in the same light. A crossed frame has no such steps:
-its phases are those of the exact depth, and its brightness is that of the 18 horizontal steps.
+Fringes of one direction learn from the 18 steps of the same view in the same light. A crossed frame
+has no such steps: its phases are those of the exact depth, and its brightness is that of the 18
+horizontal steps.
 """
 
 from collections.abc import Iterable
@@ -17,7 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.learned.fringe_net import FringeScene, Phases, fringe_channels, phases_of
+from fpp_ml_bench.baselines.learned.fringe_net import (
+    FringeScene,
+    Phases,
+    fringe_channels,
+    phases_of,
+)
 from fpp_ml_bench.baselines.learned.inputs import Geometry
 from fpp_ml_bench.baselines.learned.network import FringeNet, mean_over, scale_loss
 from fpp_ml_bench.baselines.learned.scenes import View
@@ -35,14 +41,15 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
 Fringes = Literal["lines", "crossed"]
 FRINGES: tuple[Fringes, ...] = get_args(Fringes)
-SMALL = 0.05  # error of M and D below which its loss is quadratic, in the amplitude of the surroundings
+SMALL = 0.05
+"""Error of M and D below which its loss is quadratic, in the amplitude of the surroundings."""
 MARGIN_PERIODS = 0.5  # of the crop around the object
 
 
 @dataclass(frozen=True)
 class FringeRecipe(StepRecipe):
-    """``fringes``: of either direction, or crossed; ``widths`` and ``fine``: of the network; ``near_edge``: share of
-    windows beside depth edges; ``weight_*``: of the losses."""
+    """``fringes``: of either direction, or crossed; ``widths`` and ``fine``: of the network;
+    ``near_edge``: share of windows beside depth edges; ``weight_*``: of the losses."""
 
     name: str = "fringe-net"
     steps: int = 9000
@@ -62,7 +69,11 @@ class FringeRecipe(StepRecipe):
     family: ClassVar[Family] = FRINGE_NETWORKS
     main_loss: ClassVar[str] = "phase"
     scores: ClassVar[dict[str, dict[str, str]]] = {
-        "validation, phase error in rad": {"interior_rad": "interior", "edge_rad": "edge", "drawn_rad": "drawn lights"},
+        "validation, phase error in rad": {
+            "interior_rad": "interior",
+            "edge_rad": "edge",
+            "drawn_rad": "drawn lights",
+        },
     }
 
     def __post_init__(self) -> None:
@@ -86,13 +97,15 @@ class FringeRecipe(StepRecipe):
         return FringeNet(2 if self.fringes == "crossed" else 1, self.widths, self.fine)
 
     def losses(self, network: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """``phase``: smooth L1 of M and D in the amplitude of the surroundings; ``scale``: negative log-likelihood of
-        the phase error in rad under a Laplace distribution."""
+        """``phase``: smooth L1 of M and D in the amplitude of the surroundings; ``scale``: negative
+        log-likelihood of the phase error in rad under a Laplace distribution."""
         (answer,), truth, fitted = network(batch["x"]), batch["truth"], batch["fitted"][:, None]
         count = truth.shape[1] // 2
         vectors, scale = answer[:, : 2 * count], answer[:, 2 * count :]
         by_pixel = functional.smooth_l1_loss(vectors, truth, beta=SMALL, reduction="none")
-        phase, true = (torch.atan2(maps[:, :count], maps[:, count:]) for maps in (vectors.detach(), truth))
+        phase, true = (
+            torch.atan2(maps[:, :count], maps[:, count:]) for maps in (vectors.detach(), truth)
+        )
         error = torch.atan2(torch.sin(phase - true), torch.cos(phase - true)).abs()
         return {
             "phase": mean_over(by_pixel, fitted.expand_as(by_pixel)),
@@ -113,22 +126,35 @@ class FringeTask(Task):
         self.geometries: dict[Direction, Geometry] = {}
         if recipe.fringes == "crossed":
             if rig.crossed is None:
-                raise RecipeError("fringe-net --fringes crossed: expected a rig with crossed frames, this one has none")
+                raise RecipeError(
+                    "fringe-net --fringes crossed: expected a rig with crossed frames, this one "
+                    "has none"
+                )
             self.carriers = Carriers.of(rig, rig.crossed)
             self.frames, self.decoded = (rig.sequence.crossed_frames[0],), DIRECTIONS[:1]
             self.period_px = {"crossed": self.carriers.period_px}
         else:
-            self.geometries = {way: Geometry(OneCarrier(rig, Settings(direction=way))) for way in DIRECTIONS}
-            self.frames, self.decoded = tuple(rig.sequence.sinusoids(way)[0] for way in DIRECTIONS), DIRECTIONS
-            self.period_px = {str(way): geometry.period_px for way, geometry in self.geometries.items()}
+            self.geometries = {
+                way: Geometry(OneCarrier(rig, Settings(direction=way))) for way in DIRECTIONS
+            }
+            self.frames, self.decoded = (
+                tuple(rig.sequence.sinusoids(way)[0] for way in DIRECTIONS),
+                DIRECTIONS,
+            )
+            self.period_px = {
+                str(way): geometry.period_px for way, geometry in self.geometries.items()
+            }
 
     def samples(self, views: Iterable[View]) -> list[Sample]:
-        """Samples of ``views``, whose frames are followed by M and D of the directions that are ``decoded``."""
+        """Samples of ``views``, whose frames are followed by M and D of the directions that are
+        ``decoded``."""
         samples = []
         for number, view in enumerate(views):
             if not view.target.any():
                 continue
-            ways: tuple[Direction, ...] = DIRECTIONS[:1] if self.carriers is not None else DIRECTIONS
+            ways: tuple[Direction, ...] = (
+                DIRECTIONS[:1] if self.carriers is not None else DIRECTIONS
+            )
             if self.carriers is None and view.united:
                 ways = (DIRECTIONS[number % 2],)
             samples += [self._sample(view, direction) for direction in ways]
@@ -145,11 +171,15 @@ class FringeTask(Task):
         truth = frames[first : first + 2]
         if self.carriers is not None:
             carriers, weights = self.carriers.at(crop), self.carriers.family.weights
-            phases = carriers.phases(carriers.nearness(np.where(part.target, part.depth_mm, 1000.0)))
+            phases = carriers.phases(
+                carriers.nearness(np.where(part.target, part.depth_mm, 1000.0))
+            )
             bright = np.hypot(*truth) * np.array(weights, np.float32)[:, None, None]
             truth = np.concatenate([bright * np.sin(phases), bright * np.cos(phases)])
         missing = np.clip(truth / scene.unit_grey, -4, 4) * part.target
-        return Sample.of(part, scene.single(np.float16), missing.astype(np.float16), direction=direction)
+        return Sample.of(
+            part, scene.single(np.float16), missing.astype(np.float16), direction=direction
+        )
 
     def _turned(self, sample: Sample, maps: NDArray, truth: bool = False) -> NDArray:
         """Maps (..., h, w) of a sample rotated for the network; ``truth``: M and D."""
@@ -160,13 +190,15 @@ class FringeTask(Task):
         return turned * np.array([rotation.sign, 1], np.float32)[:, None, None] if truth else turned
 
     def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:
-        """A random window of one of ``samples``: the network's input, ``truth``, M and D, and where it counts. Columns
-        of one carrier, along which its phase does not grow, are mirrored."""
+        """A random window of one of ``samples``: the network's input, ``truth``, M and D, and where
+        it counts. Columns of one carrier, along which its phase does not grow, are mirrored."""
         size, sample = self.recipe.window, samples[random.integers(len(samples))]
         rows, columns = sample.place(size, self.recipe.near_edge, random)
         maps = {
             "x": self._turned(sample, fringe_channels(sample.scene.window(rows, columns).single())),
-            "truth": self._turned(sample, sample.missing[:, rows, columns].astype(np.float32), truth=True),
+            "truth": self._turned(
+                sample, sample.missing[:, rows, columns].astype(np.float32), truth=True
+            ),
             "fitted": self._turned(sample, sample.target[rows, columns]),
         }
         if self.carriers is None and random.random() < 0.5:
@@ -179,13 +211,21 @@ class FringeTask(Task):
         return phases_of([network], np.ascontiguousarray(x))
 
     def score(self, network: FringeNet, sample: Sample) -> dict[str, float | None]:
-        """Mean phase error in rad of a sample's object beyond `EDGE_BAND_PX` from its silhouette, and nearer; whether
-        it is within the stated standard uncertainty; the same error of all pixels in drawn lights."""
-        found, truth = self.answer(network, sample), self._turned(sample, sample.missing.astype(np.float32), truth=True)
+        """Mean phase error in rad of a sample's object beyond `EDGE_BAND_PX` from its silhouette,
+        and nearer; whether it is within the stated standard uncertainty; the same error of all
+        pixels in drawn lights."""
+        found, truth = (
+            self.answer(network, sample),
+            self._turned(sample, sample.missing.astype(np.float32), truth=True),
+        )
         count = len(truth) // 2
-        error = np.abs(wrapped(found.phase_rad - np.arctan2(truth[:count], truth[count:]))).mean(axis=0)
+        error = np.abs(wrapped(found.phase_rad - np.arctan2(truth[:count], truth[count:]))).mean(
+            axis=0
+        )
         target = np.ascontiguousarray(self._turned(sample, sample.target))
-        inner = cv2.erode(target.astype(np.uint8), np.ones((2 * EDGE_BAND_PX + 1,) * 2, np.uint8)) > 0
+        inner = (
+            cv2.erode(target.astype(np.uint8), np.ones((2 * EDGE_BAND_PX + 1,) * 2, np.uint8)) > 0
+        )
         within = (error < found.sigma_rad.mean(axis=0))[target]
 
         def mean(where: NDArray) -> float | None:
@@ -201,5 +241,11 @@ class FringeTask(Task):
     def scores(self, network: FringeNet, samples: list[Sample]) -> dict[str, float]:
         return mean_scores(self.score(network, sample) for sample in samples)
 
-    def chosen(self, network: FringeNet, samples: list[Sample], validation: list[Sample], out: Path) -> dict[str, Any]:
-        return {"threshold": 0.0, "period_px": self.period_px, "validation": self.scores(network, validation)}
+    def chosen(
+        self, network: FringeNet, samples: list[Sample], validation: list[Sample], out: Path
+    ) -> dict[str, Any]:
+        return {
+            "threshold": 0.0,
+            "period_px": self.period_px,
+            "validation": self.scores(network, validation),
+        }

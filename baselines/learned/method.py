@@ -1,5 +1,5 @@
-"""The learned methods of ``fpp-bench predict``: phase-net and crossed-net measure depth in one captured frame, without
-a range given; classical-net averages and fills what the decoder finds."""
+"""The learned methods of ``fpp-bench predict``: phase-net and crossed-net measure depth in one
+captured frame, without a range given; classical-net averages and fills what the decoder finds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -32,7 +32,13 @@ from fpp_ml_bench.baselines.phase.method import (
 )
 from fpp_ml_bench.baselines.phase.observe import OneCarrier, TwoCarriers
 from fpp_ml_bench.baselines.phase.route import Measured, one_carrier, two_carriers
-from fpp_ml_bench.baselines.phase.settings import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
+from fpp_ml_bench.baselines.phase.settings import (
+    AMBIENT_GREY,
+    DIRECTION,
+    MIN_CONFIDENCE,
+    WHITE_GREY,
+    Settings,
+)
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import PredictionError
@@ -48,8 +54,8 @@ if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.submission.description import Submission
 
 STEPS = 3
-"""Phase steps of classical-net where a rig's code leaves the choice and no others are asked for: noise is what it takes
-away."""
+"""Phase steps of classical-net where a rig's code leaves the choice and no others are asked for:
+noise is what it takes away."""
 WEIGHTS = "weights file of fpp-bench train (default: the weights that come with the package)"
 """Help of an option that all learned methods have."""
 SEEDS = (42, 1, 2)
@@ -60,7 +66,8 @@ ALBEDOS: tuple[Albedo, ...] = get_args(Albedo)
 
 
 class LearnedMethod(Method):
-    """A method whose network learns from views that its training renders of the training objects."""
+    """A method whose network learns from views that its training renders of the training
+    objects."""
 
     Training = OwnViews
     recipe: ClassVar[str]
@@ -77,21 +84,33 @@ class LearnedMethod(Method):
         start = given.pop("start", None)
         module, name = cls.recipe.split(":")
         recipe = getattr(import_module(f"fpp_ml_bench.baselines.learned.{module}"), name)(**given)
-        trained = train_net(recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True)
+        trained = train_net(
+            recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True
+        )
         if trained.weights is None:
             steps = f"{trained.steps} of {recipe.steps} steps"
             print(f"{out}: stopped after {steps}, all saved; run the same command to resume")
             return False
         scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
-        print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
-        print(f"next: fpp-bench predict {cls.name} DATASET --weights {trained.weights} --out predictions")
+        print(
+            f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; "
+            f"validation: {scores}"
+        )
+        print(
+            f"next: fpp-bench predict {cls.name} DATASET --weights {trained.weights} --out "
+            f"predictions"
+        )
         return True
 
     def use(self, weights: "str | Path | WeightsFile", family: "Family | None" = None) -> None:
-        """Take its network from weights that come with the package, or a file; of `PHASE_NETWORKS`, ready to predict,
-        or of another ``family``."""
+        """Take its network from weights that come with the package, or a file; of `PHASE_NETWORKS`,
+        ready to predict, or of another ``family``."""
         from fpp_ml_bench.baselines.learned.network import SHIPPED, load_net
-        from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, WeightsFile, shipped_names
+        from fpp_ml_bench.baselines.training.weights import (
+            PHASE_NETWORKS,
+            WeightsFile,
+            shipped_names,
+        )
 
         if not isinstance(weights, WeightsFile):
             weights = load_net(weights, family is None, family or PHASE_NETWORKS)
@@ -108,14 +127,17 @@ class LearnedMethod(Method):
     @property
     def learned_from(self) -> dict[str, Any] | None:
         recipe = self.weights_config.recipe
-        lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
+        lights = (
+            f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed "
+            f"{recipe.get('seed')}"
+        )
         return {"data": "generated", "versions": [lights]}
 
 
 class LearnedRoute(LearnedMethod, RouteMethod[Measured]):
-    """A learned method that measures every map of a sample with `route`, and its network in ``threads``. Images whose
-    fringe period in px differs by more than ``period_tolerance`` from that of the training images are resampled to
-    theirs."""
+    """A learned method that measures every map of a sample with `route`, and its network in
+    ``threads``. Images whose fringe period in px differs by more than ``period_tolerance`` from
+    that of the training images are resampled to theirs."""
 
     threads: int
     period_tolerance: float
@@ -125,10 +147,13 @@ class LearnedRoute(LearnedMethod, RouteMethod[Measured]):
         learned_px = self.weights_config.period_px.get(fringes)
         if learned_px is None:
             raise PredictionError(
-                f"{self.file.path}: learned from {', '.join(self.weights_config.period_px)} fringes only, not from "
+                f"{self.file.path}: learned from {', '.join(self.weights_config.period_px)} "
+                f"fringes only, not from "
                 f"{fringes} ones; use other weights, or a measured route (phase, crossed)"
             )
-        return Periods(learned_px / self.period_tolerance, learned_px, learned_px * self.period_tolerance)
+        return Periods(
+            learned_px / self.period_tolerance, learned_px, learned_px * self.period_tolerance
+        )
 
     def measure(self, frames: Frames) -> Measured:
         from fpp_ml_bench.baselines.networks.base import torch_threads
@@ -146,7 +171,8 @@ class PhaseNetOptions:
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     albedo: Albedo | None = option(
         None,
-        "one: all surfaces have the background's albedo, and brightness tells the order; any: brightness is not used, "
+        "one: all surfaces have the background's albedo, and brightness tells the order; any: "
+        "brightness is not used, "
         "and the order is ambiguous unless range and shape tell it (default: one)",
     )
     threads: int = 1
@@ -158,16 +184,19 @@ class PhaseNetOptions:
 class PhaseNetTraining(OwnViews):
     """Training of phase-net; ``start``: weights to start from."""
 
-    albedo: Albedo | None = option(None, "one: brightness is a cue for the order; any: it is not (default: one)")
+    albedo: Albedo | None = option(
+        None, "one: brightness is a cue for the order; any: it is not (default: one)"
+    )
     start: Path | None = option(None, "weights to start from (default: none)", "FILE")
 
 
 class PhaseNetMethod(LearnedRoute[FringeMeasurement]):
-    """Depth from the first sinusoid of one ``direction``. ``albedo``: "one", where all surfaces have the background's,
-    so that brightness tells the order, or "any", where it is ambiguous unless range and shape tell it; or
-    ``weights``, a shipped name or a file, which say what they learned. ``min_confidence``: pixels below it are masked;
-    ``white_grey`` and ``ambient_grey``: as of `Settings`, for images without a lit background. Raises `WeightsError`
-    for weights that can't be used, and `PredictionError` for an invalid option."""
+    """Depth from the first sinusoid of one ``direction``. ``albedo``: "one", where all surfaces
+    have the background's, so that brightness tells the order, or "any", where it is ambiguous
+    unless range and shape tell it; or ``weights``, a shipped name or a file, which say what they
+    learned. ``min_confidence``: pixels below it are masked; ``white_grey`` and ``ambient_grey``: as
+    of `Settings`, for images without a lit background. Raises `WeightsError` for weights that can't
+    be used, and `PredictionError` for an invalid option."""
 
     name = "phase-net"
     recipe = "recipes:PhaseRecipe"
@@ -191,7 +220,9 @@ class PhaseNetMethod(LearnedRoute[FringeMeasurement]):
         settings = submission.settings
         weights, albedo = str(settings["weights"]), settings.get("albedo", "one")
         name = printable(weights.removesuffix(f"-{albedo}-albedo"))
-        return f"{name}, 1 {direction_of(submission)}" + ("" if settings["shading"] else f", {albedo} albedo")
+        return f"{name}, 1 {direction_of(submission)}" + (
+            "" if settings["shading"] else f", {albedo} albedo"
+        )
 
     @classmethod
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
@@ -211,13 +242,28 @@ class PhaseNetMethod(LearnedRoute[FringeMeasurement]):
         learned = config.recipe.get("albedo")
         if learned not in ALBEDOS:
             raise PredictionError(
-                f"{self.file.path}: expected weights that this version's fpp-bench train phase-net wrote"
+                f"{self.file.path}: expected weights that this version's fpp-bench train phase-net "
+                f"wrote"
             )
         if given.albedo not in (None, learned):
-            raise PredictionError(f"{self.file.path}: learned {learned} albedo, not {given.albedo}; leave --albedo out")
-        own = {entry.name: getattr(given, entry.name) for entry in fields(Settings) if hasattr(given, entry.name)}
-        self.options, self.rig, self.threads = Settings(**own, shading=learned == "one"), rig, given.threads
-        odds, periods = Odds(config.temperature, config.offset, config.doubted), self.learned_periods(given.direction)
+            raise PredictionError(
+                f"{self.file.path}: learned {learned} albedo, not {given.albedo}; leave --albedo "
+                f"out"
+            )
+        own = {
+            entry.name: getattr(given, entry.name)
+            for entry in fields(Settings)
+            if hasattr(given, entry.name)
+        }
+        self.options, self.rig, self.threads = (
+            Settings(**own, shading=learned == "one"),
+            rig,
+            given.threads,
+        )
+        odds, periods = (
+            Odds(config.temperature, config.offset, config.doubted),
+            self.learned_periods(given.direction),
+        )
         model = OneCarrier(rig, self.options, periods)
         part = PhaseNetPart(Geometry(model), self.file.network, config.threshold, config.lead, odds)
         self.route = one_carrier(model, learned=part)
@@ -226,7 +272,8 @@ class PhaseNetMethod(LearnedRoute[FringeMeasurement]):
         self.by_range = rig.periods_in_range(given.direction) < 1
         learned_parts = "order by range; mask" if self.by_range else "order, mask"
         self.title = (
-            f"Phase route, one {given.direction} fringe, {learned} albedo; {learned_parts} and correction learned"
+            f"Phase route, one {given.direction} fringe, {learned} albedo; {learned_parts} and "
+            f"correction learned"
             f"{self.more}"
         )
         self.settings = {
@@ -250,9 +297,10 @@ class CrossedNetOptions:
 
 
 class CrossedNetMethod(LearnedRoute[Measurement]):
-    """Depth from one crossed frame by the weights ``weights`` (a shipped name or a file), or from the mean of the first
-    fringe of both directions where the rig has no crossed frame. ``min_confidence``: pixels below it are masked. Raises
-    `WeightsError` for weights that can't be used, and `PredictionError` for a rig whose fringes they did not learn."""
+    """Depth from one crossed frame by the weights ``weights`` (a shipped name or a file), or from
+    the mean of the first fringe of both directions where the rig has no crossed frame.
+    ``min_confidence``: pixels below it are masked. Raises `WeightsError` for weights that can't be
+    used, and `PredictionError` for a rig whose fringes they did not learn."""
 
     name = "crossed-net"
     recipe = "recipes:CrossedRecipe"
@@ -287,7 +335,9 @@ class CrossedNetMethod(LearnedRoute[Measurement]):
         part = CrossedNetPart(model.carriers, self.file.network, config.threshold, config.lead)
         self.route = two_carriers(model, learned=part)
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
-        self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{self.more}"
+        self.title = (
+            f"Crossed fringes, one frame{made}; order, mask and correction learned{self.more}"
+        )
         self.settings = {**vars(given), **self.weights_settings, "order_lead": config.lead}
 
     def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
@@ -301,7 +351,9 @@ class FringeNetOptions:
     fringes: Literal["horizontal", "vertical", "crossed"] | None = option(
         None, "the frame to take (default: crossed where the rig has such frames, else horizontal)"
     )
-    members: int = option(MEMBERS, f"networks whose answers are averaged, 1 to {MEMBERS} (default: {MEMBERS})", "N")
+    members: int = option(
+        MEMBERS, f"networks whose answers are averaged, 1 to {MEMBERS} (default: {MEMBERS})", "N"
+    )
     weights: "str | Path | WeightsFile | None" = option(None, WEIGHTS, "FILE")
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     threads: int = 1
@@ -314,14 +366,17 @@ class FringeNetTraining(OwnViews):
     fringes: Literal["lines", "crossed"] | None = option(
         None, "lines: fringes of one direction, either; crossed: both in one frame (default: lines)"
     )
-    seed: int | None = option(None, "of weights, lights and windows: another network (default: 42)", "N")
+    seed: int | None = option(
+        None, "of weights, lights and windows: another network (default: 42)", "N"
+    )
 
 
 class FringeNetMethod(LearnedRoute[Measurement]):
-    """Depth from one frame whose wrapped phase networks give as numerator and denominator (`fringe_net`); mask, order
-    and depth as of `phase` or `crossed`. ``members`` of the shipped ensemble, or the network in ``weights`` alone. The
-    first sinusoid of a direction, or a crossed frame: ``fringes``. Raises `WeightsError` for weights that can't be
-    used, and `PredictionError` for an invalid option."""
+    """Depth from one frame whose wrapped phase networks give as numerator and denominator
+    (`fringe_net`); mask, order and depth as of `phase` or `crossed`. ``members`` of the shipped
+    ensemble, or the network in ``weights`` alone. The first sinusoid of a direction, or a crossed
+    frame: ``fringes``. Raises `WeightsError` for weights that can't be used, and `PredictionError`
+    for an invalid option."""
 
     name = "fringe-net"
     recipe = "fringe_recipe:FringeRecipe"
@@ -343,11 +398,16 @@ class FringeNetMethod(LearnedRoute[Measurement]):
     def short_name(cls, submission: "Submission") -> str | None:
         if not submission.name.startswith("Wrapped phase"):
             return None
-        return f"{cls.name}, 1 {submission.settings['fringes']}{pitch_words(submission.settings, ', ')}"
+        return (
+            f"{cls.name}, 1 "
+            f"{submission.settings['fringes']}{pitch_words(submission.settings, ', ')}"
+        )
 
     @classmethod
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
-        return RANGE_AND_WALL if settings.get("fringes") == "crossed" else fringe_assumption(settings)
+        return (
+            RANGE_AND_WALL if settings.get("fringes") == "crossed" else fringe_assumption(settings)
+        )
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.learned.fringe_net import CrossedPhases, FringePhase
@@ -355,13 +415,22 @@ class FringeNetMethod(LearnedRoute[Measurement]):
         from fpp_ml_bench.baselines.training.weights import FRINGE_NETWORKS
 
         given = self.checked_options(options)
-        crossed = bool(rig.sequence.crossed_frames) if given.fringes is None else given.fringes == "crossed"
+        crossed = (
+            bool(rig.sequence.crossed_frames)
+            if given.fringes is None
+            else given.fringes == "crossed"
+        )
         fringes = given.fringes or ("crossed" if crossed else "horizontal")
         if crossed and not rig.sequence.crossed_frames:
-            raise PredictionError(f"{self.name} --fringes crossed: this rig projects no crossed frame")
+            raise PredictionError(
+                f"{self.name} --fringes crossed: this rig projects no crossed frame"
+            )
         if not 1 <= given.members <= MEMBERS:
             raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
-        family, names = "crossed" if crossed else "lines", [given.weights] if given.weights else None
+        family, names = (
+            "crossed" if crossed else "lines",
+            [given.weights] if given.weights else None,
+        )
         networks, hashes = [], []
         for weights in names or [f"fringe-net-{family}-{seed}" for seed in SEEDS[: given.members]]:
             self.use(weights, FRINGE_NETWORKS)
@@ -378,8 +447,10 @@ class FringeNetMethod(LearnedRoute[Measurement]):
             )
             if here != learned:
                 raise PredictionError(
-                    f"{self.file.path}: learned crossed fringes of pitches, angles and weights {learned}, this rig "
-                    f"projects {here}; train networks on it, or use crossed-net or crossed, which measure any"
+                    f"{self.file.path}: learned crossed fringes of pitches, angles and weights "
+                    f"{learned}, this rig "
+                    f"projects {here}; train networks on it, or use crossed-net or crossed, which "
+                    f"measure any"
                 )
             self.frames_used = rig.sequence.crossed_frames[:1]
             pair = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), periods=periods)
@@ -388,7 +459,10 @@ class FringeNetMethod(LearnedRoute[Measurement]):
         else:
             way: Direction = "vertical" if fringes == "vertical" else "horizontal"
             fringe_options(self.name, rig, {"direction": way})
-            own, other_pitch = Settings(direction=way, min_confidence=given.min_confidence), pitch_setting(rig, way)
+            own, other_pitch = (
+                Settings(direction=way, min_confidence=given.min_confidence),
+                pitch_setting(rig, way),
+            )
             model = OneCarrier(rig, own, periods)
             self.route = one_carrier(model, learned=FringePhase(Geometry(model), networks))
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
@@ -400,7 +474,9 @@ class FringeNetMethod(LearnedRoute[Measurement]):
             **self.weights_settings,
             "fringes": fringes,
             "members": len(networks),
-            "weights_sha256": hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode()).hexdigest(),
+            "weights_sha256": hashes[0]
+            if len(hashes) == 1
+            else sha256("".join(hashes).encode()).hexdigest(),
             **other_pitch,
         }
 
@@ -409,17 +485,22 @@ class FringeNetMethod(LearnedRoute[Measurement]):
 class ClassicalNetOptions:
     """Options of `ClassicalNetMethod`."""
 
-    direction: Directions | None = option(None, "fringes to use (default: those that the weights learned)")
-    steps: int | None = option(None, "phase steps a direction, 3 to 18, with Gray code (default: 3)", "N")
+    direction: Directions | None = option(
+        None, "fringes to use (default: those that the weights learned)"
+    )
+    steps: int | None = option(
+        None, "phase steps a direction, 3 to 18, with Gray code (default: 3)", "N"
+    )
     weights: str | Path = option("classical-net", WEIGHTS, "FILE")
     threads: int = 1
 
 
 class ClassicalNetMethod(LearnedMethod):
-    """`ClassicalMethod` of one ``direction`` (default: the one it learned) and ``steps`` (default: 3). The weights
-    ``weights`` (a shipped name or a file) average its depth over neighbours, by at most three stated standard
-    uncertainties, and fill it where it has none. Raises `WeightsError` for weights that can't be used, and
-    `PredictionError` for a code whose uncertainty is not known."""
+    """`ClassicalMethod` of one ``direction`` (default: the one it learned) and ``steps`` (default:
+    3). The weights ``weights`` (a shipped name or a file) average its depth over neighbours, by at
+    most three stated standard uncertainties, and fill it where it has none. Raises `WeightsError`
+    for weights that can't be used, and `PredictionError` for a code whose uncertainty is not
+    known."""
 
     name = "classical-net"
     recipe = "filter_recipe:FilterRecipe"
@@ -428,7 +509,9 @@ class ClassicalNetMethod(LearnedMethod):
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
-        return [{}] if all(isinstance(rig.code(way), PhaseShift) for way in rig.directions[:1]) else []
+        return (
+            [{}] if all(isinstance(rig.code(way), PhaseShift) for way in rig.directions[:1]) else []
+        )
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:
@@ -450,7 +533,8 @@ class ClassicalNetMethod(LearnedMethod):
         fringes = [code for code in codes if isinstance(code, PhaseShift)]
         if len(fringes) < len(codes):
             raise PredictionError(
-                f"{self.name}: needs the uncertainty of every pixel, which {codes[0].title} does not give; use "
+                f"{self.name}: needs the uncertainty of every pixel, which {codes[0].title} does "
+                f"not give; use "
                 f"{ClassicalMethod.name}"
             )
         if steps is None and all(code.is_plain for code in fringes):
@@ -466,7 +550,11 @@ class ClassicalNetMethod(LearnedMethod):
         from fpp_ml_bench.baselines.networks.base import torch_threads
 
         decoded, modulation = self.classical.measure(frames)
-        scene = None if decoded.sigma_mm is None else DepthScene.of(decoded.depth, decoded.sigma_mm, modulation)
+        scene = (
+            None
+            if decoded.sigma_mm is None
+            else DepthScene.of(decoded.depth, decoded.sigma_mm, modulation)
+        )
         if scene is None:
             return decoded
         with torch_threads(self.threads):

@@ -1,10 +1,12 @@
-"""The views that the learned methods learn from: objects in lights that are drawn at random, rendered and kept.
+"""The views that the learned methods learn from: objects in lights that are drawn at random,
+rendered and kept.
 
-A light is drawn stage by stage of the image formation: exposure, noise, ambient light, response, defocus, blur, albedo
-maps, gloss, shadows. Each serves several views, so that some of them can be united into one image: the nearest surface
-of two or three objects at every pixel, for depth jumps and creases that no single object has. All share rig and light,
-so a union is what the rig would capture of all of them (they may intersect), except for the shadows that they cast on
-one another. The validation views are the validation objects in two lights of the benchmark, and in drawn ones.
+A light is drawn stage by stage of the image formation: exposure, noise, ambient light, response,
+defocus, blur, albedo maps, gloss, shadows. Each serves several views, so that some of them can be
+united into one image: the nearest surface of two or three objects at every pixel, for depth jumps
+and creases that no single object has. All share rig and light, so a union is what the rig would
+capture of all of them (they may intersect), except for the shadows that they cast on one another.
+The validation views are the validation objects in two lights of the benchmark, and in drawn ones.
 """
 
 import json
@@ -37,7 +39,8 @@ from fpp_ml_bench.pool import mapping
 VALIDATION_LIGHTS = ("paper", "workshop")
 DRAWN_VALIDATION_VIEWS = 3  # of validation objects in each light that is drawn for them
 SHADOW_GREY = 6.0
-"""Grey levels by which a background must be darker than the other to count as an object's shadow on the plane."""
+"""Grey levels by which a background must be darker than the other to count as an object's shadow on
+the plane."""
 MOST_OBJECTS = 3  # objects in one union, at most
 
 
@@ -53,9 +56,10 @@ class Group:
 
 @dataclass(frozen=True)
 class View:
-    """A rendered view: ``frames`` uint8 (n, H, W), those that were asked for, or float16 with the numerators and
-    denominators of decoded phases behind them, in grey levels; ``depth_mm`` float32 (H, W), exact, 0 = background;
-    ``void`` bool (H, W): unlit or mixed pixels, which have no depth to learn; ``united``: it joins several objects."""
+    """A rendered view: ``frames`` uint8 (n, H, W), those that were asked for, or float16 with the
+    numerators and denominators of decoded phases behind them, in grey levels; ``depth_mm`` float32
+    (H, W), exact, 0 = background; ``void`` bool (H, W): unlit or mixed pixels, which have no depth
+    to learn; ``united``: it joins several objects."""
 
     name: str
     object_name: str
@@ -79,8 +83,9 @@ class View:
 def photographed(
     studio: Studio, name: str, view: str, frames: tuple[int, ...]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
-    """An object in a view as a ``studio`` sees it, with the rig, light and seed of its settings: ``frames`` (indices in
-    the rig's sequence) uint8 (n, H, W), exact depth in mm float32 (H, W), 0 = background, and the pixels' `Flag`."""
+    """An object in a view as a ``studio`` sees it, with the rig, light and seed of its settings:
+    ``frames`` (indices in the rig's sequence) uint8 (n, H, W), exact depth in mm float32 (H, W), 0
+    = background, and the pixels' `Flag`."""
     scene = studio.trace(solid_mesh(name), view)
     studio.expose(scene, frames)
     depth_mm = np.zeros((studio.rig.camera.height, studio.rig.camera.width), np.float32)
@@ -89,13 +94,14 @@ def photographed(
 
 
 HELD_OUT = ("camera-blur", "dark-paint")
-"""Axes of `fpp-bench robustness` that no drawn light has, so that they tell what a method does in trouble that it never
-learned: one of the optics, one of the surface. Of the optics, camera blur is the one whose kin, defocus, is still
-drawn."""
+"""Axes of `fpp-bench robustness` that no drawn light has, so that they tell what a method does in
+trouble that it never learned: one of the optics, one of the surface. Of the optics, camera blur is
+the one whose kin, defocus, is still drawn."""
 
 
 def drawn_light(random: np.random.Generator) -> Light:
-    """A light drawn from ``random``, from nearly that of the paper to a poor workshop's; without what is `HELD_OUT`."""
+    """A light drawn from ``random``, from nearly that of the paper to a poor workshop's; without
+    what is `HELD_OUT`."""
 
     def even(low: float, high: float) -> float:
         return float(random.uniform(low, high))
@@ -148,11 +154,13 @@ def drawn_light(random: np.random.Generator) -> Light:
 def groups_of(
     lights: int, views_a_light: int, seed: int, textured_every: int = 1, validation_lights: int = 0
 ) -> list[Group]:
-    """The groups to render: training objects in the paper's light, every second view, then in ``lights`` drawn ones,
-    and the validation objects in `VALIDATION_LIGHTS` and in ``validation_lights`` drawn ones. Every
-    ``textured_every``-th drawn light has the albedo maps and the gloss that were drawn; the others show one matte
-    material."""
-    training, validation = ([name for name in OBJECTS if split_of(name) == split] for split in ("train", "validation"))
+    """The groups to render: training objects in the paper's light, every second view, then in
+    ``lights`` drawn ones, and the validation objects in `VALIDATION_LIGHTS` and in
+    ``validation_lights`` drawn ones. Every ``textured_every``-th drawn light has the albedo maps
+    and the gloss that were drawn; the others show one matte material."""
+    training, validation = (
+        [name for name in OBJECTS if split_of(name) == split] for split in ("train", "validation")
+    )
     plain = tuple(
         (name, VIEWS[(number + 2 * turn) % len(VIEWS)])
         for number, name in enumerate(training)
@@ -174,13 +182,18 @@ def groups_of(
     for light in VALIDATION_LIGHTS:
         views = tuple((name, view) for name in validation for view in VIEWS[::2])
         groups.append(Group(f"validation-{light}", named_light(light), views, "validation"))
-    groups += [drawn(n, validation, DRAWN_VALIDATION_VIEWS, "validation") for n in range(validation_lights)]
+    groups += [
+        drawn(n, validation, DRAWN_VALIDATION_VIEWS, "validation") for n in range(validation_lights)
+    ]
     return groups
 
 
 def fingerprint_of(recipe: dict[str, Any], groups: list[Group]) -> str:
     """SHA-256 of a training's recipe and of the views that it renders."""
-    views = [[group.name, group.split, group.light.model_dump(mode="json"), group.views] for group in groups]
+    views = [
+        [group.name, group.split, group.light.model_dump(mode="json"), group.views]
+        for group in groups
+    ]
     return sha256(json.dumps([recipe, views], sort_keys=True).encode()).hexdigest()
 
 
@@ -193,10 +206,15 @@ def render_views(
     show: bool = False,
     decoded: tuple[Direction, ...] = (),
 ) -> None:
-    """Render what ``folder`` does not hold yet of ``frames`` (indices in the rig's sequence), a file a view, and behind
-    them numerator and denominator of the phase that all steps of the directions ``decoded`` tell. ``show``: progress on
-    stderr. Raises OSError where ``folder`` can't be written."""
-    missing = [group for group in groups if not all(_file(folder, group, *view).exists() for view in group.views)]
+    """Render what ``folder`` does not hold yet of ``frames`` (indices in the rig's sequence), a
+    file a view, and behind them numerator and denominator of the phase that all steps of the
+    directions ``decoded`` tell. ``show``: progress on stderr. Raises OSError where ``folder`` can't
+    be written."""
+    missing = [
+        group
+        for group in groups
+        if not all(_file(folder, group, *view).exists() for view in group.views)
+    ]
     with Display("rendering views", sum(len(group.views) for group in missing), show) as display:
         if missing:
             folder.mkdir(parents=True, exist_ok=True)
@@ -205,7 +223,9 @@ def render_views(
                     display.step(count)
 
 
-def _render_group(work: tuple[Rig, tuple[int, ...], Path, tuple[Direction, ...]], group: Group) -> int:
+def _render_group(
+    work: tuple[Rig, tuple[int, ...], Path, tuple[Direction, ...]], group: Group
+) -> int:
     rig, frames, folder, decoded = work
     steps = [rig.sequence.sinusoids(direction) for direction in decoded]
     objects = tuple(sorted({name for name, _ in group.views}))
@@ -216,8 +236,12 @@ def _render_group(work: tuple[Rig, tuple[int, ...], Path, tuple[Direction, ...]]
         taken = dict(zip(every, stack, strict=True))
         images = np.stack([taken[frame] for frame in frames])
         for direction, each in zip(decoded, steps, strict=True):
-            phase, modulation, _ = wrapped_phase([taken[step] for step in each], rig.shifts_rad(direction), np.float32)
-            images = np.concatenate([images, modulation * [np.sin(phase), np.cos(phase)]]).astype(np.float16)
+            phase, modulation, _ = wrapped_phase(
+                [taken[step] for step in each], rig.shifts_rad(direction), np.float32
+            )
+            images = np.concatenate([images, modulation * [np.sin(phase), np.cos(phase)]]).astype(
+                np.float16
+            )
         content = BytesIO()
         np.savez_compressed(content, frames=images, depth_mm=depth_mm, void=(flags & VOID) != 0)
         write_atomically(_file(folder, group, name, view), content.getvalue(), sync=False)
@@ -225,7 +249,8 @@ def _render_group(work: tuple[Rig, tuple[int, ...], Path, tuple[Direction, ...]]
 
 
 def read_views(folder: Path, groups: list[Group], split: str) -> Iterator[View]:
-    """The rendered views of a split, group after group. Raises `TrainingError` for a file that can't be read."""
+    """The rendered views of a split, group after group. Raises `TrainingError` for a file that
+    can't be read."""
     for group in groups:
         for name, view in group.views if group.split == split else ():
             file = _file(folder, group, name, view)
@@ -243,14 +268,18 @@ def _file(folder: Path, group: Group, name: str, view: str) -> Path:
 
 
 def with_unions(views: Iterable[View], unions: int, seed: int) -> Iterator[View]:
-    """``views``, group after group, each followed by ``unions`` for each of its views with others of the group."""
+    """``views``, group after group, each followed by ``unions`` for each of its views with others
+    of the group."""
     made = 0
     for _, members in groupby(views, lambda view: view.group):
         group = []
         for view in members:
             group.append(view)
             yield view
-        objects, by_name = {view.name: view.object_name for view in group}, {view.name: view for view in group}
+        objects, by_name = (
+            {view.name: view.object_name for view in group},
+            {view.name: view for view in group},
+        )
         for number, view in enumerate(group):
             for copy in range(unions):
                 random = np.random.default_rng([seed, made, number, copy])
@@ -261,11 +290,14 @@ def with_unions(views: Iterable[View], unions: int, seed: int) -> Iterator[View]
 
 
 def united(views: list[View]) -> View:
-    """All objects of ``views`` together. The nearest surface counts; without one, the first image's background, or
-    another image's where it is in shadow."""
+    """All objects of ``views`` together. The nearest surface counts; without one, the first image's
+    background, or another image's where it is in shadow."""
     ranges = np.stack([np.where(view.depth_mm > 0, view.depth_mm, np.inf) for view in views])
     nearest = ranges.argmin(axis=0)[None]
-    depth, void = (np.take_along_axis(maps, nearest, axis=0)[0] for maps in (ranges, np.stack([v.void for v in views])))
+    depth, void = (
+        np.take_along_axis(maps, nearest, axis=0)[0]
+        for maps in (ranges, np.stack([v.void for v in views]))
+    )
     stacked = np.stack([view.frames for view in views])
     frames, darkest = np.take_along_axis(stacked, nearest[:, None], axis=0)[0], stacked.min(axis=0)
     empty = np.isinf(depth)
@@ -281,8 +313,8 @@ def united(views: list[View]) -> View:
 
 
 def companions(objects: Mapping[str, str], view: str, random: np.random.Generator) -> list[str]:
-    """One or two views of objects that differ from that of ``view`` and from each other; fewer if there are none.
-    ``objects``: the object of every view to choose from."""
+    """One or two views of objects that differ from that of ``view`` and from each other; fewer if
+    there are none. ``objects``: the object of every view to choose from."""
     members = [view]
     for _ in range(int(random.integers(1, MOST_OBJECTS))):
         shown = {objects[member] for member in members}

@@ -1,9 +1,9 @@
-"""What the trainings of phase-net, crossed-net and classical-net have in common: windows of rendered views; no dataset
-is needed. Views in drawn lights are rendered, measured, and cut into windows; a moving average of the weights is kept;
-mask and order are chosen on validation views.
+"""What the trainings of phase-net, crossed-net and classical-net have in common: windows of
+rendered views; no dataset is needed. Views in drawn lights are rendered, measured, and cut into
+windows; a moving average of the weights is kept; mask and order are chosen on validation views.
 
-``out`` holds ``views/``, the files of the engine and, at the end, the weights instead of the checkpoint. A stopped
-training continues at every stage.
+``out`` holds ``views/``, the files of the engine and, at the end, the weights instead of the
+checkpoint. A stopped training continues at every stage.
 """
 
 import hashlib
@@ -26,7 +26,13 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS
-from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net, mask_loss, mean_over, scale_loss
+from fpp_ml_bench.baselines.learned.network import (
+    PhaseNet,
+    load_net,
+    mask_loss,
+    mean_over,
+    scale_loss,
+)
 from fpp_ml_bench.baselines.learned.odds import Answers, decided_mask
 from fpp_ml_bench.baselines.learned.scenes import (
     HELD_OUT,
@@ -71,7 +77,9 @@ from fpp_ml_bench.optics.sequence import Direction
 
 VIEWS = "views"
 SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
-IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
+IMPOSSIBLE = -1e4
+"""Logit of an order that puts its pixel out of the working range: finite, for gradients to stay
+so."""
 LARGEST_GRADIENT = 50.0
 MOST = {"views_a_light": 40, "unions": 100}  # of a recipe
 
@@ -79,18 +87,22 @@ Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
 
 
 def batch_of(windows: Sequence[Window]) -> Batch:
-    batch = {name: torch.from_numpy(np.stack([window[name] for window in windows])) for name in windows[0]}
+    batch = {
+        name: torch.from_numpy(np.stack([window[name] for window in windows]))
+        for name in windows[0]
+    }
     batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
     return batch
 
 
 @dataclass(frozen=True)
 class StepRecipe(ABC):
-    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine;
-    ``averaged``: decay of the moving average of the weights, which is what the weights file holds; ``lights`` that are
-    drawn, ``views_a_light`` of training objects in each, ``unions`` for every view, ``textured_every``-th of the lights
-    with albedo maps and gloss, and ``validation_lights`` for validation objects (see `groups_of`). A subclass says
-    which network learns what. Raises `RecipeError` for values that train nothing."""
+    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps
+    falling as a cosine; ``averaged``: decay of the moving average of the weights, which is what the
+    weights file holds; ``lights`` that are drawn, ``views_a_light`` of training objects in each,
+    ``unions`` for every view, ``textured_every``-th of the lights with albedo maps and gloss, and
+    ``validation_lights`` for validation objects (see `groups_of`). A subclass says which network
+    learns what. Raises `RecipeError` for values that train nothing."""
 
     name: str = ""
     steps: int = 5000
@@ -125,7 +137,10 @@ class StepRecipe(ABC):
             if not least <= value <= most:
                 raise RecipeError(f"{name} {value!r}: expected {least} to {most}")
         if not self.rate > 0 or not 0 <= self.averaged < 1:
-            raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
+            raise RecipeError(
+                f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and "
+                f"{self.averaged}"
+            )
 
     @property
     def weights_name(self) -> str:
@@ -135,7 +150,11 @@ class StepRecipe(ABC):
     @property
     def weights(self) -> dict[str, float]:
         """Of the losses, by name: the fields ``weight_*``."""
-        return {name.removeprefix("weight_"): value for name, value in vars(self).items() if name.startswith("weight_")}
+        return {
+            name.removeprefix("weight_"): value
+            for name, value in vars(self).items()
+            if name.startswith("weight_")
+        }
 
     @abstractmethod
     def network(self) -> nn.Module:
@@ -167,8 +186,8 @@ class StepRecipe(ABC):
 
 @dataclass(frozen=True)
 class WindowRecipe(StepRecipe):
-    """Of a `PhaseNet`: ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses, ``weight_scale`` that
-    of the stated uncertainty."""
+    """Of a `PhaseNet`: ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses,
+    ``weight_scale`` that of the stated uncertainty."""
 
     name: str = "phase-net"
     widths: tuple[int, ...] = (24, 32, 48, 64)
@@ -185,21 +204,36 @@ class WindowRecipe(StepRecipe):
     main_loss: ClassVar[str] = "phase"
     scores: ClassVar[dict[str, dict[str, str]]] = {
         "validation MAE, mm": {"object_mae_mm": "object", "right_mae_mm": "right order"},
-        "validation, % of object pixels": {"wrong_percent": "wrong order", "missed_percent": "missed"},
+        "validation, % of object pixels": {
+            "wrong_percent": "wrong order",
+            "missed_percent": "missed",
+        },
     }
 
     def network(self) -> PhaseNet:
-        return PhaseNet(self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, len(self.inputs))
+        return PhaseNet(
+            self.widths,
+            self.fine,
+            self.squeezed,
+            self.order_widths,
+            self.bound_rad,
+            len(self.inputs),
+        )
 
     def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
-        """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad;
-        ``scale``: negative log-likelihood of its phase error under a Laplace distribution."""
+        """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``:
+        smooth L1 in rad; ``scale``: negative log-likelihood of its phase error under a Laplace
+        distribution."""
         order, inside, correction, scale = network(batch["x"])
         logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
         fitted = batch["fitted"]
-        by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum")
+        by_order = functional.cross_entropy(
+            logits, batch["order"], ignore_index=IGNORED, reduction="sum"
+        )
         target_rad = batch["correction_rad"].clamp(-self.bound_rad, self.bound_rad)
-        by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
+        by_phase = functional.smooth_l1_loss(
+            correction, target_rad, beta=SMALL_RAD, reduction="none"
+        )
         error = (correction.detach() - batch["correction_rad"]).abs()
         return {
             "order": by_order / fitted.sum().clamp(min=1),
@@ -210,10 +244,11 @@ class WindowRecipe(StepRecipe):
 
 
 class WindowTraining(Training):
-    """Training in intervals between two validations, on the processor. Windows are those of ``task``, drawn
-    from ``samples``; it is validated on ``scored``. ``start``: the network whose weights it starts from (None: random
-    ones). ``show``: every new record is printed. Raises `TrainingError` where
-    ``start`` is another network than the recipe's, and for a checkpoint of another recipe."""
+    """Training in intervals between two validations, on the processor. Windows are those of
+    ``task``, drawn from ``samples``; it is validated on ``scored``. ``start``: the network whose
+    weights it starts from (None: random ones). ``show``: every new record is printed. Raises
+    `TrainingError` where ``start`` is another network than the recipe's, and for a checkpoint of
+    another recipe."""
 
     largest_gradient = LARGEST_GRADIENT
 
@@ -228,26 +263,45 @@ class WindowTraining(Training):
     ) -> None:
         recipe: StepRecipe = task.recipe
         super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
-        self.recipe, self.task, self.samples, self.scored, self.show = recipe, task, samples, scored, show
+        self.recipe, self.task, self.samples, self.scored, self.show = (
+            recipe,
+            task,
+            samples,
+            scored,
+            show,
+        )
         self.name = self.title = recipe.name
         self.interval_steps, self.total_steps = recipe.validate_every, recipe.steps
         network = recipe.network()
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
             if start.options != network.options:
-                raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
+                raise TrainingError(
+                    f"weights to start from: expected {network.options}, got {start.options}"
+                )
             network.load_state_dict(start.state_dict())
-        self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
+        self.averaged = AveragedModel(
+            network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True
+        )
         self.bare = {"network": network, "averaged": self.averaged}
-        optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
+        optimizer = torch.optim.AdamW(
+            network.parameters(), lr=recipe.rate, weight_decay=recipe.decay
+        )
         prepared, prepared_optimizer = self.accelerator.prepare(network, optimizer)
-        self.modules, self.optimizers, self.objective = {"network": prepared}, {"network": prepared_optimizer}, self
+        self.modules, self.optimizers, self.objective = (
+            {"network": prepared},
+            {"network": prepared_optimizer},
+            self,
+        )
         self.resume()
 
     def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
-        """As of `training.Objective`: the weighted losses; the average is updated after every step."""
+        """As of `training.Objective`: the weighted losses; the average is updated after every
+        step."""
         parts = self.recipe.losses(self.modules["network"], batch)
-        total = torch.stack([weight * parts[name] for name, weight in self.recipe.weights.items()]).sum()
+        total = torch.stack(
+            [weight * parts[name] for name, weight in self.recipe.weights.items()]
+        ).sum()
         yield "network", total, {name: value.detach() for name, value in parts.items()}
         self.averaged.update_parameters(self.modules["network"])
 
@@ -264,7 +318,8 @@ class WindowTraining(Training):
         return self.recipe.rate_at(self.steps_done + number)
 
     def batches(self) -> Iterator[Batch]:
-        """The batches up to the next validation: each is a function of seed and step alone, made one step ahead."""
+        """The batches up to the next validation: each is a function of seed and step alone, made
+        one step ahead."""
         first, last, recipe = self.steps_done, self._next_validation, self.recipe
 
         def make(step: int) -> Batch:
@@ -280,7 +335,10 @@ class WindowTraining(Training):
                 yield batch
 
     def diverged(self, name: str, value: float, number: int) -> str:
-        return f"the loss is {value} at step {self.steps_done + number + 1}; lower the rate and start again"
+        return (
+            f"the loss is {value} at step {self.steps_done + number + 1}; lower the rate and start "
+            f"again"
+        )
 
     def validated(self, losses: dict[str, float], began: float) -> Record:
         seconds, steps = perf_counter() - began, self._next_validation
@@ -293,21 +351,27 @@ class WindowTraining(Training):
 
     def progress(self) -> str:
         shown = self.recipe.main_loss
-        return f"step {self.steps_done}/{self.recipe.steps}  {shown} {self.history[-1][f'loss_{shown}']:.4g}"
+        return (
+            f"step {self.steps_done}/{self.recipe.steps}  {shown} "
+            f"{self.history[-1][f'loss_{shown}']:.4g}"
+        )
 
     def panels(self) -> list[Panel]:
         def panel(title: str, labels: dict[str, str], log: bool = False) -> Panel:
             return Panel.of(title, self.history, "step", labels, log)
 
-        shown = {f"loss_{name}": name for name in self.recipe.weights if name != "scale"}  # a log-likelihood
+        shown = {
+            f"loss_{name}": name for name in self.recipe.weights if name != "scale"
+        }  # a log-likelihood
         scores = [panel(title, labels) for title, labels in self.recipe.scores.items()]
         return [panel("training losses", shown, log=True), *scores]
 
 
 class Task(ABC):
-    """What a network learns from rendered views of a rig: samples of the views, windows of the samples, and what
-    is chosen on validation samples. ``frames``: those it takes, and behind them what the steps of the directions
-    ``decoded`` tell; of the validation samples every ``scored_share``-th is scored during training."""
+    """What a network learns from rendered views of a rig: samples of the views, windows of the
+    samples, and what is chosen on validation samples. ``frames``: those it takes, and behind them
+    what the steps of the directions ``decoded`` tell; of the validation samples every
+    ``scored_share``-th is scored during training."""
 
     recipe: Any
     frames: tuple[int, ...]
@@ -327,16 +391,19 @@ class Task(ABC):
         """Mean scores of a network."""
 
     @abstractmethod
-    def chosen(self, network: Any, samples: list[Sample], validation: list[Sample], out: Path) -> dict[str, Any]:
-        """The fields of `training.NetConfig` that are chosen on the validation samples for the trained network, and its
-        scores there; pictures of that go to ``out``."""
+    def chosen(
+        self, network: Any, samples: list[Sample], validation: list[Sample], out: Path
+    ) -> dict[str, Any]:
+        """The fields of `training.NetConfig` that are chosen on the validation samples for the
+        trained network, and its scores there; pictures of that go to ``out``."""
 
 
 class CandidateTask(Task):
-    """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are tried on the
-    validation samples, thresholds also on every ``chosen_share``-th training sample; sums of errors ``tolerance_mm``
-    from the least count as equal, and for fewer missed pixels the background error may grow by ``growth``. An order is
-    wrong where the phase is more than ``wrong_rad`` off."""
+    """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are
+    tried on the validation samples, thresholds also on every ``chosen_share``-th training sample;
+    sums of errors ``tolerance_mm`` from the least count as equal, and for fewer missed pixels the
+    background error may grow by ``growth``. An order is wrong where the phase is more than
+    ``wrong_rad`` off."""
 
     thresholds: ClassVar[tuple[float, ...]]
     leads: ClassVar[tuple[float, ...]]
@@ -349,9 +416,11 @@ class CandidateTask(Task):
         self.recipe, self.image_px = recipe, rig.camera.width * rig.camera.height
 
     @abstractmethod
-    def varied(self, sample: Sample, scene: Any, missing: Image, random: np.random.Generator, *truth: Mask) -> Window:
-        """The training example of a window's ``scene``, varied; ``missing`` and ``truth``, target and void, of the
-        sample there."""
+    def varied(
+        self, sample: Sample, scene: Any, missing: Image, random: np.random.Generator, *truth: Mask
+    ) -> Window:
+        """The training example of a window's ``scene``, varied; ``missing`` and ``truth``, target
+        and void, of the sample there."""
 
     @abstractmethod
     def answers(self, network: PhaseNet, sample: Sample) -> Answers:
@@ -359,7 +428,8 @@ class CandidateTask(Task):
 
     @abstractmethod
     def changes_rad(self, answers: Answers, sample: Sample) -> Image:
-        """By how much the answers change the phase of a sample's scene: each pixel's likeliest order is taken."""
+        """By how much the answers change the phase of a sample's scene: each pixel's likeliest
+        order is taken."""
 
     @abstractmethod
     def depth_mm(self, sample: Sample, change_rad: Image) -> NDArray:
@@ -369,14 +439,17 @@ class CandidateTask(Task):
         sample = samples[random.integers(len(samples))]
         size = self.recipe.window
         where = sample.place(size, self.recipe.vary.near_edge, random)
-        scene, missing = sample.scene.window(*where).single(), sample.missing[where].astype(np.float32)
+        scene, missing = (
+            sample.scene.window(*where).single(),
+            sample.missing[where].astype(np.float32),
+        )
         return self.varied(sample, scene, missing, random, sample.target[where], sample.void[where])
 
     def score(self, answers: Answers, sample: Sample, inside: Mask) -> dict[str, float | None]:
-        """`view_scores` of a sample whose pixels ``inside`` are object. ``right_mae_mm``: MAE of detected pixels with
-        the right order; ``wrong_percent`` of the object's pixels; ``within_percent``: errors of the phase within the
-        stated standard uncertainty, 68 of a normal distribution. Where no order is right, it and ``right_mae_mm`` are
-        None."""
+        """`view_scores` of a sample whose pixels ``inside`` are object. ``right_mae_mm``: MAE of
+        detected pixels with the right order; ``wrong_percent`` of the object's pixels;
+        ``within_percent``: errors of the phase within the stated standard uncertainty, 68 of a
+        normal distribution. Where no order is right, it and ``right_mae_mm`` are None."""
         target, change = sample.target, self.changes_rad(answers, sample)
         found, true = (self.depth_mm(sample, rad) for rad in (change, sample.missing))
         apart = np.abs(change - sample.missing)
@@ -386,10 +459,14 @@ class CandidateTask(Task):
         return view_scores(sample, inside, found, true) | {
             "right_mae_mm": float(error.mean(dtype=np.float64)) if right.any() else None,
             "wrong_percent": 100 * float(wrong[target].mean()),
-            "within_percent": 100 * float((apart < answers.sigma_rad)[right].mean()) if right.any() else None,
+            "within_percent": 100 * float((apart < answers.sigma_rad)[right].mean())
+            if right.any()
+            else None,
         }
 
-    def scores_of(self, answers: Iterable[Answers], samples: list[Sample], threshold: float = 0.0) -> dict[str, float]:
+    def scores_of(
+        self, answers: Iterable[Answers], samples: list[Sample], threshold: float = 0.0
+    ) -> dict[str, float]:
         """Means of each `score` over the samples that have it."""
         return mean_scores(
             self.score(one, sample, decided_mask(one, sample.scene.single(), threshold))
@@ -399,7 +476,9 @@ class CandidateTask(Task):
     def scores(self, network: PhaseNet, samples: list[Sample]) -> dict[str, float]:
         return self.scores_of((self.answers(network, sample) for sample in samples), samples)
 
-    def chosen(self, network: PhaseNet, samples: list[Sample], validation: list[Sample], out: Path) -> dict[str, Any]:
+    def chosen(
+        self, network: PhaseNet, samples: list[Sample], validation: list[Sample], out: Path
+    ) -> dict[str, Any]:
         """Threshold, and the lead by which the fewest orders are wrong."""
         answers = [self.answers(network, sample) for sample in validation]
         further = samples[:: self.chosen_share] if self.chosen_share else []
@@ -408,7 +487,9 @@ class CandidateTask(Task):
             (sample, partial(decided_mask, one, sample.scene.single()))
             for one, sample in zip(masked, validation + further, strict=True)
         ]
-        threshold = chosen_threshold(masks, self.thresholds, self.image_px, self.tolerance_mm, self.growth)
+        threshold = chosen_threshold(
+            masks, self.thresholds, self.image_px, self.tolerance_mm, self.growth
+        )
         with_leads = ([one.with_lead(lead) for one in answers] for lead in self.leads)
         wrong = [self.scores_of(shifted, validation)["wrong_percent"] for shifted in with_leads]
         lead = self.leads[int(np.argmin(wrong))]
@@ -419,14 +500,16 @@ class CandidateTask(Task):
         return fields
 
     @abstractmethod
-    def calibrated(self, fields: dict[str, Any], answers: list[Answers], validation: list[Sample], out: Path) -> None:
+    def calibrated(
+        self, fields: dict[str, Any], answers: list[Answers], validation: list[Sample], out: Path
+    ) -> None:
         """Add the other ``fields``, from the ``answers`` with the lead that was chosen."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """The weights file (None for a training that stopped because its minutes were over), validation scores, and the
-    mask threshold that was chosen there."""
+    """The weights file (None for a training that stopped because its minutes were over), validation
+    scores, and the mask threshold that was chosen there."""
 
     weights: Path | None
     steps: int
@@ -444,12 +527,17 @@ def train_net(
     workers: int = 1,
     show: bool = False,
 ) -> Trained:
-    """Train for ``rig`` (default: that of the recipe), starting from the weights in ``start`` or from random ones; the
-    same call resumes a training that was stopped. ``show``: progress on stderr, and a line for every
-    validation. Raises `TrainingError` for a folder of another recipe or rig."""
+    """Train for ``rig`` (default: that of the recipe), starting from the weights in ``start`` or
+    from random ones; the same call resumes a training that was stopped. ``show``: progress on
+    stderr, and a line for every validation. Raises `TrainingError` for a folder of another recipe
+    or rig."""
     started, rig = perf_counter(), rig or NAMED_RIGS[recipe.rig]()
     groups = groups_of(
-        recipe.lights, recipe.views_a_light, recipe.seed, recipe.textured_every, recipe.validation_lights
+        recipe.lights,
+        recipe.views_a_light,
+        recipe.seed,
+        recipe.textured_every,
+        recipe.validation_lights,
     )
     first = None if start is None else load_net(start, folded=False)
     described = recipe.to_dict() | {"rig": rig.to_dict()}
@@ -461,10 +549,15 @@ def train_net(
         if not weights.exists():
             task = recipe.task(rig)
             render_views(groups, rig, task.frames, out / VIEWS, workers, show, task.decoded)
-            with Display("measuring views", sum(len(group.views) for group in groups), show) as display:
+            with Display(
+                "measuring views", sum(len(group.views) for group in groups), show
+            ) as display:
 
                 def measured(split: str, unions: int) -> list[Sample]:
-                    views, done = read_views(out / VIEWS, groups, split), int(display.tasks[0].completed)
+                    views, done = (
+                        read_views(out / VIEWS, groups, split),
+                        int(display.tasks[0].completed),
+                    )
                     followed = display.track(views, completed=done, task_id=display.bar)
                     return task.samples(with_unions(followed, unions, recipe.seed))
 

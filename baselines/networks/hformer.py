@@ -1,6 +1,6 @@
-"""Hformer (Zhu et al. 2022, as the benchmark's conference version ran it): a convolutional backbone of four branches
-without exchange between them, then a U of global transformers over the branches' pixels. All sizes are those of the
-authors' published code (AnushLak/fpp-ml-bench)."""
+"""Hformer (Zhu et al. 2022, as the benchmark's conference version ran it): a convolutional backbone
+of four branches without exchange between them, then a U of global transformers over the branches'
+pixels. All sizes are those of the authors' published code (AnushLak/fpp-ml-bench)."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -9,7 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.networks import base
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, ResidualBlock, TransformerLayer, in_full_precision
+from fpp_ml_bench.baselines.networks.base import (
+    FringeNetwork,
+    ResidualBlock,
+    TransformerLayer,
+    in_full_precision,
+)
 
 HEADS = (1, 1, 2, 4)
 ENCODER_DEPTHS = (1, 1, 2, 2)
@@ -30,13 +35,17 @@ def _first(x: Tensor) -> Tensor:
 
 
 def _convolution(c_in: int, c_out: int, stride: int) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False), nn.BatchNorm2d(c_out), nn.ReLU(inplace=True))
+    return nn.Sequential(
+        nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False),
+        nn.BatchNorm2d(c_out),
+        nn.ReLU(inplace=True),
+    )
 
 
 class Backbone(nn.Module):
-    """(B, 1, H, W) -> four branches (B, c_i, h_i, w_i) at 1/4, 1/8, 1/16 and 1/32 of the image: a stem, then three
-    stages. Each opens the next branch by a stride-2 convolution of the last one, and passes every branch by itself
-    through a convolution and residual blocks."""
+    """(B, 1, H, W) -> four branches (B, c_i, h_i, w_i) at 1/4, 1/8, 1/16 and 1/32 of the image: a
+    stem, then three stages. Each opens the next branch by a stride-2 convolution of the last one,
+    and passes every branch by itself through a convolution and residual blocks."""
 
     def __init__(self, stem: int, branches: Sequence[int]) -> None:
         super().__init__()
@@ -52,8 +61,14 @@ class Backbone(nn.Module):
             lanes = nn.ModuleList()
             for lane, channels in enumerate(branches[: stage + 1]):
                 opens = lane == stage
-                entry = _convolution(branches[lane - 1] if opens else channels, channels, 2 if opens else 1)
-                lanes.append(nn.Sequential(entry, *(ResidualBlock(channels, channels) for _ in range(blocks))))
+                entry = _convolution(
+                    branches[lane - 1] if opens else channels, channels, 2 if opens else 1
+                )
+                lanes.append(
+                    nn.Sequential(
+                        entry, *(ResidualBlock(channels, channels) for _ in range(blocks))
+                    )
+                )
             self.stages.append(lanes)
 
     def forward(self, fringe: Tensor) -> list[Tensor]:
@@ -77,11 +92,14 @@ class Embed(nn.Module):
 
 
 class Level(nn.Module):
-    """Transformer layers over all pixels of a map, and a layer norm if asked, (B, C, h, w) -> the same."""
+    """Transformer layers over all pixels of a map, and a layer norm if asked, (B, C, h, w) -> the
+    same."""
 
     def __init__(self, channels: int, heads: int, drop_paths: Sequence[float], norm: bool) -> None:
         super().__init__()
-        self.layers = nn.Sequential(*(TransformerLayer(channels, heads, MLP_RATIO, drop) for drop in drop_paths))
+        self.layers = nn.Sequential(
+            *(TransformerLayer(channels, heads, MLP_RATIO, drop) for drop in drop_paths)
+        )
         self.norm = nn.LayerNorm(channels) if norm else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -91,7 +109,8 @@ class Level(nn.Module):
 
 
 class MergePatches(nn.Module):
-    """2x2 pixels into one, and the branch joined: (B, C, 2h, 2w) and (B, 2C, h, w) -> (B, 2C, h, w)."""
+    """2x2 pixels into one, and the branch joined: (B, C, 2h, 2w) and (B, 2C, h, w) -> (B, 2C, h,
+    w)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -103,11 +122,14 @@ class MergePatches(nn.Module):
         channels, height, width = x.shape[1:]
         quads = _last(x).reshape(-1, height // 2, 2, width // 2, 2, channels)
         patches = quads.transpose(2, 3).flatten(3)
-        return _first(self.join(torch.cat((self.reduce(self.norm(patches)), _last(branch)), dim=-1)))
+        return _first(
+            self.join(torch.cat((self.reduce(self.norm(patches)), _last(branch)), dim=-1))
+        )
 
 
 class ExpandPatches(nn.Module):
-    """One pixel into 2x2, the encoder's map joined, layers: (B, 2C, h, w) and (B, C, 2h, 2w) -> (B, C, 2h, 2w)."""
+    """One pixel into 2x2, the encoder's map joined, layers: (B, 2C, h, w) and (B, C, 2h, 2w) -> (B,
+    C, 2h, 2w)."""
 
     def __init__(self, channels: int, heads: int, drop_paths: Sequence[float]) -> None:
         super().__init__()
@@ -124,12 +146,14 @@ class ExpandPatches(nn.Module):
 
 
 class Hformer(FringeNetwork):
-    """Token widths width x (1, 2, 4, 8) at 1/4 to 1/32 of the image; 4,655,993 parameters at width 32.
+    """Token widths width x (1, 2, 4, 8) at 1/4 to 1/32 of the image; 4,655,993 parameters at width
+    32.
 
-    width: channels of the first token level, a multiple of 4. The stem has 2 x width channels, the branches
-    9/16 x width (rounded) x (1, 2, 4, 8). drop_path: rate of the deepest layer's DropPath, rising from 0 at the first
-    layer of the encoder; a decoder level has its encoder level's rates. Attention is global, so time grows with the
-    fourth power of the image side. There are no position embeddings: zero padding in the backbone tells pixels apart.
+    width: channels of the first token level, a multiple of 4. The stem has 2 x width channels, the
+    branches 9/16 x width (rounded) x (1, 2, 4, 8). drop_path: rate of the deepest layer's DropPath,
+    rising from 0 at the first layer of the encoder; a decoder level has its encoder level's rates.
+    Attention is global, so time grows with the fourth power of the image side. There are no
+    position embeddings: zero padding in the backbone tells pixels apart.
     """
 
     name = "hformer"
@@ -145,16 +169,22 @@ class Hformer(FringeNetwork):
         drops = iter([drop_path * layer / last for layer in range(last + 1)])
         level_drops = [[next(drops) for _ in range(depth)] for depth in ENCODER_DEPTHS]
         self.backbone = Backbone(2 * width, branches)
-        self.embeds = nn.ModuleList(Embed(c_in, c_out) for c_in, c_out in zip(branches, tokens, strict=True))
+        self.embeds = nn.ModuleList(
+            Embed(c_in, c_out) for c_in, c_out in zip(branches, tokens, strict=True)
+        )
         levels = zip(tokens, HEADS, level_drops, strict=True)
-        self.encoder = nn.ModuleList(Level(c, heads, rates, norm=True) for c, heads, rates in levels)
+        self.encoder = nn.ModuleList(
+            Level(c, heads, rates, norm=True) for c, heads, rates in levels
+        )
         self.merges = nn.ModuleList(MergePatches(c) for c in tokens[:3])
         self.decoder = nn.ModuleList(
             ExpandPatches(tokens[level], HEADS[level], level_drops[level][:depth])
             for level, depth in zip((2, 1, 0), DECODER_DEPTHS, strict=True)
         )
         self.up1 = nn.Sequential(nn.ConvTranspose2d(width, width // 2, 2, 2), nn.ReLU(inplace=True))
-        self.up2 = nn.Sequential(nn.ConvTranspose2d(width // 2, width // 4, 2, 2), nn.ReLU(inplace=True))
+        self.up2 = nn.Sequential(
+            nn.ConvTranspose2d(width // 2, width // 4, 2, 2), nn.ReLU(inplace=True)
+        )
         self.head = nn.Conv2d(width // 4, 1, 1)
         base.initialise(self, "convolutions", "tokens")
 

@@ -1,4 +1,5 @@
-"""The networks by name, a trained one ready to use (fringe image in, depth in mm out), and networks as ONNX files."""
+"""The networks by name, a trained one ready to use (fringe image in, depth in mm out), and networks
+as ONNX files."""
 
 import importlib.util
 import inspect
@@ -33,10 +34,11 @@ Fringe = NDArray[np.uint8] | NDArray[np.floating[Any]]
 
 
 def build(name: str, **options: int | float) -> FringeNetwork:
-    """One of `NETWORKS`, untrained, in float32 on the default device. ``options`` are the network's keyword options,
-    the paper's values by default; ``width`` scales every width. The weights depend on torch's random state only.
-    ``build(network.name, **network.options)`` makes the network again. Raises `NetworkError` for an unknown name, an
-    unknown option, or a value that the network can't have."""
+    """One of `NETWORKS`, untrained, in float32 on the default device. ``options`` are the network's
+    keyword options, the paper's values by default; ``width`` scales every width. The weights depend
+    on torch's random state only. ``build(network.name, **network.options)`` makes the network
+    again. Raises `NetworkError` for an unknown name, an unknown option, or a value that the network
+    can't have."""
     if name not in _CLASSES:
         raise NetworkError(f"unknown network {name!r}; there are {', '.join(NETWORKS)}")
     return _constructed(name, _CLASSES[name], options)
@@ -51,16 +53,25 @@ def _constructed(name: str, cls: Any, options: dict[str, Any]) -> Any:
     parameters = inspect.signature(cls).parameters
     if unknown := sorted(set(options) - set(parameters)):
         available = ", ".join(f"{p.name} (default {p.default})" for p in parameters.values())
-        raise NetworkError(f"network {name!r} has no option {', '.join(map(repr, unknown))}; there are: {available}")
+        raise NetworkError(
+            f"network {name!r} has no option {', '.join(map(repr, unknown))}; there are: "
+            f"{available}"
+        )
     kinds = {option: type(parameters[option].default) for option in options}
-    checked = {n: checked_option(name, n, value, kinds[n], cls.rules.get(n, (1, 1))) for n, value in options.items()}
+    checked = {
+        n: checked_option(name, n, value, kinds[n], cls.rules.get(n, (1, 1)))
+        for n, value in options.items()
+    }
     return cls(**checked)
 
 
-def fringe_batch(fringes: Sequence[Fringe] | Fringe, size: tuple[int, int], trained_on: str) -> Tensor:
-    """Images (B, H, W), uint8 or float in [0, 1], as the network's input: float32 (B, 1, H, W) in [0, 1], on the CPU.
-    ``size`` (H, W): what the network ``trained_on`` was trained at. `PredictionError` for another size, shape or dtype,
-    and for values that are NaN or outside [0, 1]."""
+def fringe_batch(
+    fringes: Sequence[Fringe] | Fringe, size: tuple[int, int], trained_on: str
+) -> Tensor:
+    """Images (B, H, W), uint8 or float in [0, 1], as the network's input: float32 (B, 1, H, W) in
+    [0, 1], on the CPU. ``size`` (H, W): what the network ``trained_on`` was trained at.
+    `PredictionError` for another size, shape or dtype, and for values that are NaN or outside [0,
+    1]."""
     images = [grey_levels(image) for image in fringes]
     if not images:
         raise PredictionError("expected at least one fringe image, got none")
@@ -77,32 +88,42 @@ def fringe_batch(fringes: Sequence[Fringe] | Fringe, size: tuple[int, int], trai
 
 def _check_image(image: NDArray[Any], size: tuple[int, int], trained_on: str) -> None:
     if image.ndim != 2:
-        raise PredictionError(f"expected one fringe image (H, W), got shape {image.shape}; give a single grey channel")
+        raise PredictionError(
+            f"expected one fringe image (H, W), got shape {image.shape}; give a single grey channel"
+        )
     if image.shape != size:
         raise PredictionError(
-            f"expected a fringe image of {size[0]}x{size[1]} px (H x W), the size {trained_on} was trained at, got "
-            f"{image.shape[0]}x{image.shape[1]}: the fringe period in px depends on the size, so a network works at "
+            f"expected a fringe image of {size[0]}x{size[1]} px (H x W), the size {trained_on} was "
+            f"trained at, got "
+            f"{image.shape[0]}x{image.shape[1]}: the fringe period in px depends on the size, so a "
+            f"network works at "
             "one size only; use weights of that size, or a dataset built at this one"
         )
     if image.dtype == np.uint8:
         return
     if not np.issubdtype(image.dtype, np.floating):
-        raise PredictionError(f"expected a fringe image in uint8 (0 to 255) or float (0 to 1), got {image.dtype}")
+        raise PredictionError(
+            f"expected a fringe image in uint8 (0 to 255) or float (0 to 1), got {image.dtype}"
+        )
     low, high = float(image.min()), float(image.max())
     if not (low >= 0 and high <= 1):  # NaN fails this too
         raise PredictionError(
-            f"expected a float fringe image within [0, 1], got values from {low:g} to {high:g}; divide grey levels by "
+            f"expected a float fringe image within [0, 1], got values from {low:g} to {high:g}; "
+            f"divide grey levels by "
             "their largest possible value (255 for 8 bits), and leave no NaN"
         )
 
 
 def represent(network: nn.Module, fringe: Tensor, name: str) -> Tensor:
-    """Output (B, 1, H, W) of ``network``; `PredictionError` where it holds a value that is not finite."""
+    """Output (B, 1, H, W) of ``network``; `PredictionError` where it holds a value that is not
+    finite."""
     output: Tensor = network(fringe)
     if not_finite := int((~output.isfinite()).sum()):
         raise PredictionError(
-            f"{name}: the network gave {not_finite} of {output.numel()} values that are NaN or infinite; its weights "
-            "come from a training that diverged, or the precision it runs in is too low: train it again"
+            f"{name}: the network gave {not_finite} of {output.numel()} values that are NaN or "
+            f"infinite; its weights "
+            "come from a training that diverged, or the precision it runs in is too low: train it "
+            "again"
         )
     return output
 
@@ -122,12 +143,14 @@ class Model:
         return sum(parameter.numel() for parameter in self.network.parameters())
 
     def predict(self, fringe: Fringe) -> NDArray[np.float32]:
-        """Depth float32 (H, W) of one fringe image (H, W), uint8 or float in [0, 1], of the size trained at.
+        """Depth float32 (H, W) of one fringe image (H, W), uint8 or float in [0, 1], of the size
+        trained at.
 
-        Under raw or global normalisation in mm, under individual normalisation a share of the sample's depth range in
-        [0, 1], which only the ground truth turns into mm; either as the network puts it out, with values beyond and
-        all. A network trained with the background removed expects ``fringe`` to be 0 outside the object. Raises
-        `PredictionError` for another image or an output that is not finite."""
+        Under raw or global normalisation in mm, under individual normalisation a share of the
+        sample's depth range in [0, 1], which only the ground truth turns into mm; either as the
+        network puts it out, with values beyond and all. A network trained with the background
+        removed expects ``fringe`` to be 0 outside the object. Raises `PredictionError` for another
+        image or an output that is not finite."""
         return self.predict_batch([fringe])[0]
 
     def predict_batch(self, fringes: Sequence[Fringe]) -> NDArray[np.float32]:
@@ -138,17 +161,18 @@ class Model:
         return denormalise(values, self.config.normalisation, 0.0, 0.0).astype(np.float32)
 
     def predict_representation(self, fringes: Sequence[Fringe]) -> NDArray[np.float32]:
-        """The network's own output float32 (B, H, W) for images (B, H, W), in the representation it was trained on
-        (`fpp_ml_bench.depth`). Raises `PredictionError` as `predict`."""
+        """The network's own output float32 (B, H, W) for images (B, H, W), in the representation it
+        was trained on (`fpp_ml_bench.depth`). Raises `PredictionError` as `predict`."""
         batch = fringe_batch(fringes, self.config.image_size, self.config.name).to(self.device)
         with torch.inference_mode(), tiny_floats_are_zero():
             return represent(self.network, batch, self.config.name)[:, 0].float().cpu().numpy()
 
 
 def load(name_or_path: str | Path, device: str | None = None) -> Model:
-    """The weights ``name_or_path``, shipped with the package or a ``.safetensors`` file, as a `Model`. ``device``:
-    ``cpu``, ``cuda``, ...; None takes a CUDA device where there is one. `WeightsError` for an unknown name, a damaged
-    or foreign file, or a device that does not exist."""
+    """The weights ``name_or_path``, shipped with the package or a ``.safetensors`` file, as a
+    `Model`. ``device``: ``cpu``, ``cuda``, ...; None takes a CUDA device where there is one.
+    `WeightsError` for an unknown name, a damaged or foreign file, or a device that does not
+    exist."""
     weights = open_weights(weights_path(name_or_path))
     torch_device = _device(device)
     # Channels last: never slower here, and up to 1.7 times faster on a CPU (UNet, width 8, 224 px).
@@ -163,7 +187,9 @@ def _device(name: str | None) -> torch.device:
     try:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError, ValueError, TypeError) as error:
-        raise WeightsError(f"device {name!r} can't be used here: {str(error).splitlines()[0]}; give cpu") from None
+        raise WeightsError(
+            f"device {name!r} can't be used here: {str(error).splitlines()[0]}; give cpu"
+        ) from None
 
 
 INPUT = "fringe"
@@ -175,22 +201,31 @@ OPSET = 17
 def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Path:
     """Write a network as an ONNX file in float32, and return its path.
 
-    The file takes ``fringe`` float32 (B, 1, H, W) in [0, 1] and gives ``depth_representation`` of the same shape; B is
-    free, H and W are ``size`` (one number for a square). ``model``: a `FringeNetwork`, or what holds one as
-    ``.network``. Torch's older exporter takes 0.4 to 2 s where the newer takes 6 to 30 s, to the same numbers. Raises
-    `FppBenchError` where the onnx package is missing or the file can't be written, and `NetworkError` for something
-    that is no network or a size that it does not take."""
+    The file takes ``fringe`` float32 (B, 1, H, W) in [0, 1] and gives ``depth_representation`` of
+    the same shape; B is free, H and W are ``size`` (one number for a square). ``model``: a
+    `FringeNetwork`, or what holds one as ``.network``. Torch's older exporter takes 0.4 to 2 s
+    where the newer takes 6 to 30 s, to the same numbers. Raises `FppBenchError` where the onnx
+    package is missing or the file can't be written, and `NetworkError` for something that is no
+    network or a size that it does not take."""
     if importlib.util.find_spec("onnx") is None:
-        raise FppBenchError('ONNX export needs the onnx package; install it with: pip install "fpp-ml-bench[onnx]"')
+        raise FppBenchError(
+            'ONNX export needs the onnx package; install it with: pip install "fpp-ml-bench[onnx]"'
+        )
     network = model if isinstance(model, FringeNetwork) else getattr(model, "network", None)
     if not isinstance(network, FringeNetwork):
-        raise NetworkError(f"expected a network or a model that holds one; it was given {type(model).__name__}")
+        raise NetworkError(
+            f"expected a network or a model that holds one; it was given {type(model).__name__}"
+        )
     height, width = (size, size) if isinstance(size, int) else size
     network.check_size(height, width)
     target = Path(path)
     if not target.parent.is_dir():
-        raise FppBenchError(f"can't write {target}: there is no folder {target.parent}; make it first")
-    example = torch.zeros(1, 1, height, width, dtype=torch.float32, device=next(network.parameters()).device)
+        raise FppBenchError(
+            f"can't write {target}: there is no folder {target.parent}; make it first"
+        )
+    example = torch.zeros(
+        1, 1, height, width, dtype=torch.float32, device=next(network.parameters()).device
+    )
     try:
         # A file that appears under its name only when whole.
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".onnx-") as folder:

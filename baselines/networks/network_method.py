@@ -1,4 +1,5 @@
-"""A trained network as a method of the benchmark: of the metric track, or given the sample's depth range (oracle)."""
+"""A trained network as a method of the benchmark: of the metric track, or given the sample's depth
+range (oracle)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,11 +38,13 @@ _SHORT_LOSSES = {
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Options of `NetworkMethod`; the name of the method gives ``weights``, a file, or the ``recipe`` that trained
-    them."""
+    """Options of `NetworkMethod`; the name of the method gives ``weights``, a file, or the
+    ``recipe`` that trained them."""
 
     frame: int | None = option(None, "frame to take (default: the first it was trained on)", "N")
-    device: str | None = option(None, "cpu, cuda, cuda:1 (default: cuda where there is one)", "NAME")
+    device: str | None = option(
+        None, "cpu, cuda, cuda:1 (default: cuda where there is one)", "NAME"
+    )
     threads: int = 1
     weights: Path | None = None
     recipe: str | None = None
@@ -50,10 +53,11 @@ class NetworkOptions:
 class NetworkMethod(Method):
     """A `Model` that takes one frame of the sequence.
 
-    Under raw and global normalisation a network puts out mm. Under individual normalisation values go out normalised,
-    and the scoring takes the depth range of the very sample (oracle). ``frame``: its index, by default the first of
-    those that the network was trained on. ``threads`` are torch's while it predicts. ``remark`` is added to the title,
-    ``about`` to the settings. Raises `PredictionError` for a frame or a number of threads that can't be."""
+    Under raw and global normalisation a network puts out mm. Under individual normalisation values
+    go out normalised, and the scoring takes the depth range of the very sample (oracle). ``frame``:
+    its index, by default the first of those that the network was trained on. ``threads`` are
+    torch's while it predicts. ``remark`` is added to the title, ``about`` to the settings. Raises
+    `PredictionError` for a frame or a number of threads that can't be."""
 
     name = "network"  # a trained one has the name of its weights
     purpose = "trained network from image to depth"
@@ -68,7 +72,11 @@ class NetworkMethod(Method):
         from fpp_ml_bench.baselines.networks.model import load
 
         given = cls.checked_options(options)
-        path = given.weights if given.recipe is None else weights_of_recipe(given.recipe, rig.camera.width)
+        path = (
+            given.weights
+            if given.recipe is None
+            else weights_of_recipe(given.recipe, rig.camera.width)
+        )
         return cls(load(path, given.device), given.frame, given.threads, rig.sequence)
 
     @classmethod
@@ -78,10 +86,15 @@ class NetworkMethod(Method):
             options["weights"] = weights_of_recipe(recipe, dataset.size[1])
         method = cls.for_rig(dataset.rig, **options)
         if method.model.config.image_size != dataset.size:
-            trained_at, here = (f"{height}x{width}" for height, width in (method.model.config.image_size, dataset.size))
+            trained_at, here = (
+                f"{height}x{width}"
+                for height, width in (method.model.config.image_size, dataset.size)
+            )
             raise WeightsError(
-                f"{options['weights']}: was trained at {trained_at} px (H x W), {dataset.path} has images of {here} "
-                "px: the fringe period in px depends on the size, so a network works at one size only; use weights "
+                f"{options['weights']}: was trained at {trained_at} px (H x W), {dataset.path} has "
+                f"images of {here} "
+                "px: the fringe period in px depends on the size, so a network works at one size "
+                "only; use weights "
                 "trained at that size, or a dataset built at the weights' size"
             )
         return method
@@ -92,13 +105,18 @@ class NetworkMethod(Method):
         network = NETWORK_TITLES[str(settings["network"])]
         if not submission.name.startswith(f"{network}, "):
             return None
-        normalisation = {"individual": "", "raw": " raw", "global": " global"}[str(settings["normalisation"])]
+        normalisation = {"individual": "", "raw": " raw", "global": " global"}[
+            str(settings["normalisation"])
+        ]
         trained_frames = str(settings["trained_frames"])
         if trained_frames not in CONFIGS:
             return None
         frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
         # The other words of a loss are its weights.
-        loss = " ".join(_SHORT_LOSSES.get(word) or f"{float(word):g}" for word in str(settings["loss"]).split("_"))
+        loss = " ".join(
+            _SHORT_LOSSES.get(word) or f"{float(word):g}"
+            for word in str(settings["loss"]).split("_")
+        )
         seed = "" if settings.get("seed") in (None, SEED) else f" s{settings['seed']}"
         parts = [f"{network}{normalisation} {loss}{frames}{seed}"]
         parts += [word for words, word in _SHORT_OPTIONS.items() if f", {words}" in submission.name]
@@ -120,13 +138,17 @@ class NetworkMethod(Method):
         trained_frames = sequence.config(config.data_config)
         if not trained_frames:
             raise PredictionError(
-                f"{config.name}: was trained on {config.data_config} fringes, and this rig projects "
-                f"{' and '.join(sequence.directions)} ones only; use weights that were trained on its fringes"
+                f"{config.name}: was trained on {config.data_config} fringes, and this rig "
+                f"projects "
+                f"{' and '.join(sequence.directions)} ones only; use weights that were trained on "
+                f"its fringes"
             )
         usual_frame = trained_frames[0]
         self.frame = usual_frame if frame is None else frame
         if not 0 <= self.frame < len(sequence):
-            raise PredictionError(f"frame {frame}: expected 0 to {len(sequence) - 1}, the frames of the sequence")
+            raise PredictionError(
+                f"frame {frame}: expected 0 to {len(sequence) - 1}, the frames of the sequence"
+            )
         if threads < 1:
             raise PredictionError(f"threads {threads}: expected 1 or more")
         self.frames_used = (self.frame,)
@@ -157,7 +179,9 @@ class NetworkMethod(Method):
             "threads": threads,
             "device": self.device,
         }
-        self.settings = {key: value for key, value in entries.items() if value is not None} | dict(about or {})
+        self.settings = {key: value for key, value in entries.items() if value is not None} | dict(
+            about or {}
+        )
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in `units`; frames other than `frames_used` may be None."""
@@ -168,7 +192,8 @@ class NetworkMethod(Method):
         fringes = [frame for frame in (stack[self.frame] for stack in stacks) if frame is not None]
         if len(fringes) != len(stacks):
             raise PredictionError(
-                f"{self.name} needs frame {self.frame}, which was not captured; build with --config all"
+                f"{self.name} needs frame {self.frame}, which was not captured; build with "
+                f"--config all"
             )
         from fpp_ml_bench.baselines.networks.base import torch_threads
 
@@ -182,8 +207,8 @@ def _loss(loss: Any) -> str | None:
 
 
 def weights_of_recipe(recipe: str, size: int) -> Path:
-    """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
-    wide. Raises FppBenchError where there are none."""
+    """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of
+    images ``size`` px wide. Raises FppBenchError where there are none."""
     from fpp_ml_bench.baselines.reproduce.plan import RUNS, Folders
     from fpp_ml_bench.baselines.reproduce.work import current_weights
 
@@ -196,6 +221,8 @@ def weights_of_recipe(recipe: str, size: int) -> Path:
             return weights
         searched.append(f"{below / candidate.name} ({candidate.size} px)")
     raise RecipeError(
-        f"{recipe}: no finished training of it for images of {size} px, looked for {' and '.join(searched)}; train it "
-        "with fpp-bench reproduce (or fpp-bench train, and give the .safetensors file that it names)"
+        f"{recipe}: no finished training of it for images of {size} px, looked for "
+        f"{' and '.join(searched)}; train it "
+        "with fpp-bench reproduce (or fpp-bench train, and give the .safetensors file that it "
+        "names)"
     )

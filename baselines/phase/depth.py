@@ -1,15 +1,16 @@
 """Last stop: depth, its uncertainty, and the reasons not to trust a pixel.
 
-One carrier: wrapped phase and order give the depth in closed form. Its expected error has three parts. Phase: noise and
-misfit of the local fit (rms misfit divided by brightness is a phase error, and the slope of the calibration layer turns
-it into mm). Rim: there the fit extrapolates instead of averaging. Order: its margin gives the probability of a wrong
-order, whose error in mm is known.
+One carrier: wrapped phase and order give the depth in closed form. Its expected error has three
+parts. Phase: noise and misfit of the local fit (rms misfit divided by brightness is a phase error,
+and the slope of the calibration layer turns it into mm). Rim: there the fit extrapolates instead of
+averaging. Order: its margin gives the probability of a wrong order, whose error in mm is known.
 
-Two carriers: the nearness is fitted to the frame itself, ``I - ambient = g (1 + c_1 cos phase_1(q) + c_2 cos
-phase_2(q))``. Starting from the nearness of the order, g (a quadratic) and one change of q are solved for around each
-pixel. Depth jumps inside a window are in the start already. A second round, or less weight for pixels that the first
-does not explain, makes it worse. Three crossed frames: a pixel's own phase has the noise of the camera. It is averaged
-over pairs of pixels on opposite sides, but only pairs that lie on one plane with the pixel within the noise.
+Two carriers: the nearness is fitted to the frame itself, ``I - ambient = g (1 + c_1 cos phase_1(q)
++ c_2 cos phase_2(q))``. Starting from the nearness of the order, g (a quadratic) and one change of
+q are solved for around each pixel. Depth jumps inside a window are in the start already. A second
+round, or less weight for pixels that the first does not explain, makes it worse. Three crossed
+frames: a pixel's own phase has the noise of the camera. It is averaged over pairs of pixels on
+opposite sides, but only pairs that lie on one plane with the pixel within the noise.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,7 +44,13 @@ from fpp_ml_bench.baselines.phase.observe import (
     OneCarrier,
     TwoCarriers,
 )
-from fpp_ml_bench.baselines.phase.order import CrossedOrder, FringeOrder, Turns, crossed_order, margin_by_range
+from fpp_ml_bench.baselines.phase.order import (
+    CrossedOrder,
+    FringeOrder,
+    Turns,
+    crossed_order,
+    margin_by_range,
+)
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.crossed import WINDOW_PERIODS
@@ -53,45 +60,54 @@ from fpp_ml_bench.constants import MM_PER_M
 HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
 SATURATED_SHARE = 0.02
 LEAST_MARGIN = 0.1
-"""Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the rival order out."""
+"""Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the
+rival order out."""
 MARGIN_SCALE = 0.04  # margin by which the odds of two orders grow e-fold
 MISFIT_SHARE, UNKNOWN_MISFIT_SHARE = 0.3, 0.75
-"""Phase error of a local fit as a share of its relative misfit: on the benchmark's objects, and where no known
-background shows, so that light and surface may be any (a real skull, `docs/results/phase_route.md`)."""
+"""Phase error of a local fit as a share of its relative misfit: on the benchmark's objects, and
+where no known background shows, so that light and surface may be any (a real skull,
+`docs/results/phase_route.md`)."""
 SLOWEST, FASTEST = 0.35, 2.2
-"""Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window resolves."""
+"""Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window
+resolves."""
 THIN_PERIODS = 0.5
 EVIDENCE_SCALE, ENERGY_SCALE, EVEN_ODDS = 1.0, 4.0, 0.8
-"""By how much evidence and margin of energy of two carriers the odds of two orders grow e-fold, and where they are
-even."""
+"""By how much evidence and margin of energy of two carriers the odds of two orders grow e-fold, and
+where they are even."""
 LEAST_WRONG, MOST_WRONG = 0.01, 0.32
-"""Chances of a wrong order between which the rival widens the stated uncertainty. Below, it lies outside of the widest
-interval in use (99%). The variance of both orders together would state several mm for a chance of 0.1%, at pixels
-whose error is a tenth of that."""
+"""Chances of a wrong order between which the rival widens the stated uncertainty. Below, it lies
+outside of the widest interval in use (99%). The variance of both orders together would state
+several mm for a chance of 0.1%, at pixels whose error is a tenth of that."""
 LOST_SHARE, LOST_CHANCE = 0.25, 0.6
-"""Share of a carrier's contrast below which it counts as not seen, and the least probability of a wrong order then."""
+"""Share of a carrier's contrast below which it counts as not seen, and the least probability of a
+wrong order then."""
 TEXTURE_SHARE = 0.35  # rms misfit over brightness of a window that shows no crossed fringe
-TEXTURE_RAD = 0.5  # distance of both phases from the depth's at which something else than its fringes was seen
+TEXTURE_RAD = 0.5
+"""Distance of both phases from the depth's at which something else than its fringes was seen."""
 AMBIGUOUS_CHANCE = 0.3  # of a wrong order
 LEAST_GREY = 0.5  # least brightness that a change is divided by
 SYSTEMATIC_SHARE, RIM_SHARE = 0.08, 0.6
-"""Of the power of a misfit that is no noise, what acts as an error of the phase: everywhere, and more by the share of
-the window that lies beyond the object. So that 68% intervals hold 68% of the pixels of validation views."""
+"""Of the power of a misfit that is no noise, what acts as an error of the phase: everywhere, and
+more by the share of the window that lies beyond the object. So that 68% intervals hold 68% of the
+pixels of validation views."""
 NOT_AVERAGED = 0.2
-"""Of the noise of a pixel's own phase, what the mean over pixels leaves beside its noise: noise hides how far they are
-from a plane."""
+"""Of the noise of a pixel's own phase, what the mean over pixels leaves beside its noise: noise
+hides how far they are from a plane."""
 NOISE_SIGMAS = 3.0
-OWN_SYSTEMATIC_SHARE = 0.15  # phase error as a share of a misfit of the brightness that noise does not explain
+OWN_SYSTEMATIC_SHARE = 0.15
+"""Phase error as a share of a misfit of the brightness that noise does not explain."""
 
 
 class Reason(IntEnum):
-    """Why a pixel should not be trusted; of several reasons the lowest. BACKGROUND: the empty scene explains it.
-    LOW_MODULATION: too dark for a fringe, in shadow or turned away. SATURATED: clipped grey levels in the window.
-    OUT_OF_RANGE: its depth is not in the working range, and is left out. THIN: the object is thinner than half a period
-    there. TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves. ONE_DIRECTION: one carrier is
-    not to be seen, so that nothing decides the order. TEXTURE: what the window shows is no crossed fringe: stripes near
-    a carrier's period, or a depth edge. AMBIGUOUS: the candidate orders can't be told apart. WALL: the wall explains it
-    as well, or better; its uncertainty reaches the wall. UNSURE: the expected error alone is too large."""
+    """Why a pixel should not be trusted; of several reasons the lowest. BACKGROUND: the empty scene
+    explains it. LOW_MODULATION: too dark for a fringe, in shadow or turned away. SATURATED: clipped
+    grey levels in the window. OUT_OF_RANGE: its depth is not in the working range, and is left out.
+    THIN: the object is thinner than half a period there. TOO_STEEP: the fringe is compressed or
+    stretched beyond what a window resolves. ONE_DIRECTION: one carrier is not to be seen, so that
+    nothing decides the order. TEXTURE: what the window shows is no crossed fringe: stripes near a
+    carrier's period, or a depth edge. AMBIGUOUS: the candidate orders can't be told apart. WALL:
+    the wall explains it as well, or better; its uncertainty reaches the wall. UNSURE: the expected
+    error alone is too large."""
 
     MEASURED = 0
     BACKGROUND = 1
@@ -109,11 +125,12 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Measurement:
-    """Maps (H, W) of one image; 0 where there is no object. ``depth_mm`` float32, 0 = background or masked;
-    ``sigma_mm`` float32: standard uncertainty, 0 where there is no depth; ``order_doubt_mm``: the part of the expected
-    error that comes from the order; ``confidence`` float32, 0 to 1, by the expected error, 0 beyond the range;
-    ``modulation_grey`` float32: half of a white pattern's grey level; ``reason`` uint8, a `Reason`, given whether the
-    pixel was masked or not; ``background_share``: of the image that shows the plane."""
+    """Maps (H, W) of one image; 0 where there is no object. ``depth_mm`` float32, 0 = background or
+    masked; ``sigma_mm`` float32: standard uncertainty, 0 where there is no depth;
+    ``order_doubt_mm``: the part of the expected error that comes from the order; ``confidence``
+    float32, 0 to 1, by the expected error, 0 beyond the range; ``modulation_grey`` float32: half of
+    a white pattern's grey level; ``reason`` uint8, a `Reason`, given whether the pixel was masked
+    or not; ``background_share``: of the image that shows the plane."""
 
     depth_mm: Image
     sigma_mm: Image
@@ -132,8 +149,9 @@ class Measurement:
 
 @dataclass(frozen=True)
 class FringeMeasurement(Measurement):
-    """Of one carrier also ``wrapped_phase_rad`` float32 in [-pi, pi], NaN where there is no object; ``order`` int32;
-    ``candidates``: the orders that the working range allows; and ``expected_error_mm`` float32."""
+    """Of one carrier also ``wrapped_phase_rad`` float32 in [-pi, pi], NaN where there is no object;
+    ``order`` int32; ``candidates``: the orders that the working range allows; and
+    ``expected_error_mm`` float32."""
 
     wrapped_phase_rad: Image
     order: NDArray[np.int32]
@@ -167,9 +185,10 @@ class FringeMeasurement(Measurement):
 
 @dataclass(frozen=True)
 class NearnessFit:
-    """Depth of two carriers before it is judged: ``nearness`` float32 (h, w); ``brightness`` g, grey levels (a white
-    pattern's is twice as much); ``misfit_grey``: frame minus fit; ``weight``: share of the window that lies on the
-    object; ``uncertainty_rad``: standard uncertainty of the joint phase from noise and misfit, apart from the order."""
+    """Depth of two carriers before it is judged: ``nearness`` float32 (h, w); ``brightness`` g,
+    grey levels (a white pattern's is twice as much); ``misfit_grey``: frame minus fit; ``weight``:
+    share of the window that lies on the object; ``uncertainty_rad``: standard uncertainty of the
+    joint phase from noise and misfit, apart from the order."""
 
     nearness: NDArray[np.float32]
     brightness: Image
@@ -180,9 +199,10 @@ class NearnessFit:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Crossed fringes with the ``fit`` of the nearness in an order. ``candidates``: that order and the turns beside it;
-    ``rival``: nearness (h, w) of the order that it might be instead; ``wrong_chance`` (h, w): probability that it is;
-    ``wall`` bool (h, w): pixels that count as object although the wall explains them as well, or better."""
+    """Crossed fringes with the ``fit`` of the nearness in an order. ``candidates``: that order and
+    the turns beside it; ``rival``: nearness (h, w) of the order that it might be instead;
+    ``wrong_chance`` (h, w): probability that it is; ``wall`` bool (h, w): pixels that count as
+    object although the wall explains them as well, or better."""
 
     seen: CrossedObservation
     candidates: Turns
@@ -193,13 +213,14 @@ class Fitted:
 
 
 def _uncertainty_rad(seen: Observation, window: GaussianWindow) -> Image:
-    """Expected absolute error of the phase of each pixel in rad, float32 (h, w), apart from the order."""
+    """Expected absolute error of the phase of each pixel in rad, float32 (h, w), apart from the
+    order."""
     fit, background = seen.fit, seen.background
     bright = np.maximum(fit.brightness, 0.5)
     if seen.mean_grey is not None:
-        # Noise through the weights of the steps, and the difference of mean and modulation beyond it (a pixel that
-        # covers two surfaces, or is clipped). Of modulation a pixel that averages the fringe over its area loses a
-        # share that is known, without an error of the phase.
+        # Noise through the weights of the steps, and the difference of mean and modulation beyond
+        # it (a pixel that covers two surfaces, or is clipped). Of modulation a pixel that averages
+        # the fringe over its area loses a share that is known, without an error of the phase.
         _, cosine, sine = phase_weights(seen.shifts_rad)
         # Of phi = -atan2(S, C): d phi = -(C dS - S dC) / B^2 = -(cos phi dS + sin phi dC) / B.
         c, s = np.cos(fit.phase_rad), np.sin(fit.phase_rad)
@@ -218,16 +239,27 @@ def _uncertainty_rad(seen: Observation, window: GaussianWindow) -> Image:
     return np.sqrt(averaged + systematic) / bright * (share + rim) + np.hypot(*seen.slopes) * rim  # type: ignore[no-any-return]
 
 
-def _noise_and_rest(seen: Capture, power: NDArray, window: GaussianWindow, weight: NDArray) -> tuple[NDArray, NDArray]:
-    """Of the ``power`` of a misfit: noise that is left of white noise after averaging, and what is no noise."""
-    # A window of sigma s averages 4 pi s^2 pixels of white noise; what is not noise does not average.
+def _noise_and_rest(
+    seen: Capture, power: NDArray, window: GaussianWindow, weight: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Of the ``power`` of a misfit: noise that is left of white noise after averaging, and what is
+    no noise."""
+    # A window of sigma s averages 4 pi s^2 pixels of white noise; what is not noise does not
+    # average.
     noise = seen.background.noise_grey**2
-    return noise / (2 * np.pi * window.sigma_px**2 * np.maximum(weight, 0.05)), np.maximum(power - noise, 0)
+    return noise / (2 * np.pi * window.sigma_px**2 * np.maximum(weight, 0.05)), np.maximum(
+        power - noise, 0
+    )
 
 
 def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
-    """The fit to one frame under a window, from the turns of both phases that are nearest to ``nearness``."""
-    carriers, light, window = seen.carriers, seen.light, GaussianWindow(WINDOW_PERIODS * seen.period_px)
+    """The fit to one frame under a window, from the turns of both phases that are nearest to
+    ``nearness``."""
+    carriers, light, window = (
+        seen.carriers,
+        seen.light,
+        GaussianWindow(WINDOW_PERIODS * seen.period_px),
+    )
     beside = wrapped(seen.phase_rad - carriers.phases(nearness))
     nearness = nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2
     view = light, *fringes(carriers, nearness, seen.contrast)
@@ -235,9 +267,14 @@ def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
     share = np.maximum(share, 1e-6)
     curvature = np.maximum(curvature / share, 1e-3)
     bright = np.maximum(brightness, LEAST_GREY)
-    nearness = nearness + np.clip(change / bright, -LARGEST_STEP_RAD, LARGEST_STEP_RAD) / carriers.joint_gain
+    nearness = (
+        nearness
+        + np.clip(change / bright, -LARGEST_STEP_RAD, LARGEST_STEP_RAD) / carriers.joint_gain
+    )
     misfit = light - np.maximum(brightness, 0) * fringes(carriers, nearness, seen.contrast)[0]
-    averaged, rest = _noise_and_rest(seen, window.moment(misfit * misfit * seen.inside) / share, window, share)
+    averaged, rest = _noise_and_rest(
+        seen, window.moment(misfit * misfit * seen.inside) / share, window, share
+    )
     acting = SYSTEMATIC_SHARE + RIM_SHARE * (1 - np.minimum(share, 1))
     uncertainty = np.sqrt((averaged + rest * acting) / curvature) / bright
     maps = (nearness, brightness, misfit, share, uncertainty)
@@ -245,15 +282,20 @@ def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
 
 
 def _of_best_sides(seen: CrossedObservation, fit: NearnessFit) -> NearnessFit:
-    """The fit of every pixel, or of the neighbour whose surface explains the frame there better (`best_sides`)."""
+    """The fit of every pixel, or of the neighbour whose surface explains the frame there better
+    (`best_sides`)."""
 
     def raised(nearness: Image) -> Image:
         return fringes(seen.carriers, nearness, seen.contrast)[0]
 
     noise_grey, fitted = seen.background.noise_grey, (fit.nearness, fit.brightness)
-    nearness, brightness, places = best_sides(fitted, seen.light, seen.inside, raised, noise_grey, seen.period_px)
+    nearness, brightness, places = best_sides(
+        fitted, seen.light, seen.inside, raised, noise_grey, seen.period_px
+    )
     misfit = np.asarray(seen.light - brightness * raised(nearness), np.float32)
-    return NearnessFit(nearness, brightness, misfit, fit.weight[*places], fit.uncertainty_rad[*places])
+    return NearnessFit(
+        nearness, brightness, misfit, fit.weight[*places], fit.uncertainty_rad[*places]
+    )
 
 
 def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessFit:
@@ -261,7 +303,8 @@ def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessF
     carriers, modulation, contrast = seen.carriers, seen.modulation[moved], seen.contrast[moved]
     gain, bright = carriers.gain[moved], np.maximum(modulation, np.float32(LEAST_GREY * contrast))
     noise_grey = phase_noise_grey(nearness * gain, bright, seen.inside)
-    # Least squares of three equal steps: both amplitudes have 2 / 3 of the variance of a grey level.
+    # Least squares of three equal steps: both amplitudes have 2 / 3 of the variance of a grey
+    # level.
     own: Image = (noise_grey * np.sqrt(2 / CROSSED_FRAMES) / bright).astype(np.float32)
     psi, sigma = same_plane_mean(nearness * gain, own, seen.inside)
     sigma = np.hypot(sigma, np.float32(NOT_AVERAGED) * own)
@@ -269,15 +312,19 @@ def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessF
     still = (0.0, seen.contrast[1]) if moved == 0 else (seen.contrast[0], 0.0)
     misfit = seen.light - brightness * fringes(carriers, nearness, still)[0]
     unexplained = np.maximum(np.abs(misfit) - NOISE_SIGMAS * noise_grey / contrast, 0)
-    uncertainty = np.hypot(sigma, OWN_SYSTEMATIC_SHARE * unexplained / bright) * carriers.joint_gain / np.abs(gain)
+    uncertainty = (
+        np.hypot(sigma, OWN_SYSTEMATIC_SHARE * unexplained / bright)
+        * carriers.joint_gain
+        / np.abs(gain)
+    )
     weight = GaussianWindow(WINDOW_PERIODS * seen.period_px).moment(seen.inside.astype(np.float32))
     maps = (nearness, brightness, misfit, weight, uncertainty)
     return NearnessFit(*(np.asarray(values, np.float32) for values in maps))
 
 
 def reaching(apart_rad: NDArray, wrong_chance: Image) -> NDArray:
-    """Standard uncertainty whose interval of the probability 1 - ``wrong_chance`` just reaches a rival ``apart_rad``
-    away; 0 for a chance below `LEAST_WRONG`."""
+    """Standard uncertainty whose interval of the probability 1 - ``wrong_chance`` just reaches a
+    rival ``apart_rad`` away; 0 for a chance below `LEAST_WRONG`."""
     sigmas = ndtri(1 - np.clip(wrong_chance, LEAST_WRONG, MOST_WRONG) / 2)
     return np.where(wrong_chance < LEAST_WRONG, 0.0, apart_rad / sigmas)
 
@@ -299,10 +346,11 @@ def _judged(
     reasons: Mapping[Reason, Mask],
     guessed: Mask | bool = False,
 ) -> Measurement:
-    """What every measurement states of a depth (h, w), 0 beyond the object and the range, whose expected size of the
-    error is ``error_mm``: confidence, reason, and what is left of depth and error where pixels are masked; no doubt of
-    the order. ``window``: what a pixel was measured in, None for itself alone; ``reasons``: those of the model's own;
-    ``guessed``: pixels without a depth, since their order is a guess."""
+    """What every measurement states of a depth (h, w), 0 beyond the object and the range, whose
+    expected size of the error is ``error_mm``: confidence, reason, and what is left of depth and
+    error where pixels are masked; no doubt of the order. ``window``: what a pixel was measured in,
+    None for itself alone; ``reasons``: those of the model's own; ``guessed``: pixels without a
+    depth, since their order is a guess."""
     clipped: NDArray = seen.saturated.astype(np.float32)
     if window is not None:
         clipped = window.moment(clipped) / np.maximum(fit.weight, 1e-3)
@@ -338,15 +386,18 @@ def _restored(
     on_object: Mask,
     nearest: Callable[[NDArray], NDArray],
 ) -> Measurement:
-    """``measured`` in the size of the captured image: its ``depth_mm`` (H, W) follows on the pixels ``on_object`` from
-    those that were ``known``. Other maps are taken from the ``nearest`` pixel."""
+    """``measured`` in the size of the captured image: its ``depth_mm`` (H, W) follows on the pixels
+    ``on_object`` from those that were ``known``. Other maps are taken from the ``nearest``
+    pixel."""
     in_range = model.resampling.captured.in_range(depth_mm)
     found = on_object & in_range & (nearest(measured.depth_mm) > 0)
     # The nearest depth says nothing of a pixel that has none for a reason of its own.
     own = np.where(known, np.uint8(Reason.BACKGROUND), measured.reason)
     own = cv2.resize(own, found.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     reason = np.where(on_object, nearest(measured.reason), own)
-    reason[on_object & ~in_range & ((reason == Reason.MEASURED) | (reason > Reason.OUT_OF_RANGE))] = Reason.OUT_OF_RANGE
+    reason[
+        on_object & ~in_range & ((reason == Reason.MEASURED) | (reason > Reason.OUT_OF_RANGE))
+    ] = Reason.OUT_OF_RANGE
 
     def taken(values: NDArray, where: Mask) -> Image:
         return np.where(where, nearest(values), np.float32(0))
@@ -363,10 +414,12 @@ def _restored(
 
 
 def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMeasurement:
-    """In the size of the captured image. The residual phase, order included, is interpolated (it has no wraps); depth,
-    wrapped phase and order follow from it at every pixel."""
+    """In the size of the captured image. The residual phase, order included, is interpolated (it
+    has no wraps); depth, wrapped phase and order follow from it at every pixel."""
     inside = np.isfinite(measured.wrapped_phase_rad)
-    psi = np.where(inside, model.layer.residual_phase(measured.wrapped_phase_rad, measured.order), 0.0)
+    psi = np.where(
+        inside, model.layer.residual_phase(measured.wrapped_phase_rad, measured.order), 0.0
+    )
     on_object, phases, nearest = model.resampling.restored(psi, inside)
     layer = model.captured_layer
     absolute = np.where(on_object, phases, np.nan) + layer.infinity_rad + TAU * layer.infinity_order
@@ -395,8 +448,9 @@ def _restored_crossed(model: TwoCarriers, measured: Measurement) -> Measurement:
 
 
 def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
-    """The measurement that follows from an order of every pixel, however it was chosen. A pixel whose order is a guess
-    has no depth: one of less than the least margin, and always a tie in light that nothing calibrates."""
+    """The measurement that follows from an order of every pixel, however it was chosen. A pixel
+    whose order is a guess has no depth: one of less than the least margin, and always a tie in
+    light that nothing calibrates."""
     seen, order, margin = chosen.seen, chosen.order, chosen.margin
     guessed = margin < chosen.least_margin
     if not seen.background.calibrated:  # no evidence about the order, whatever the choice preferred
@@ -405,7 +459,10 @@ def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
     inside, layer = seen.inside, seen.layer
     depth_mm = np.where(inside, layer.depth_mm(seen.phase_rad, order), 0.0)
     depth_mm[~seen.rig.in_range(depth_mm)] = 0.0
-    ahead = layer.forward * (np.maximum(depth_mm, seen.rig.working_range_mm[0]) / MM_PER_M) + layer.back_m
+    ahead = (
+        layer.forward * (np.maximum(depth_mm, seen.rig.working_range_mm[0]) / MM_PER_M)
+        + layer.back_m
+    )
     mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
     uncertainty_rad = seen.uncertainty_rad
     if uncertainty_rad is None:
@@ -419,12 +476,17 @@ def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
         Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
         Reason.AMBIGUOUS: margin < LEAST_MARGIN,
     }
-    judged = _judged(seen, model.settings, depth_mm, error_mm, seen.fit, model.windows[1], reasons, guessed)
-    first, count = (_pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count))
+    judged = _judged(
+        seen, model.settings, depth_mm, error_mm, seen.fit, model.windows[1], reasons, guessed
+    )
+    first, count = (
+        _pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count)
+    )
     measured = FringeMeasurement.of(
         replace(
             judged,
-            sigma_mm=judged.sigma_mm * np.float32(np.sqrt(np.pi / 2)),  # of a normal error of that expected size
+            sigma_mm=judged.sigma_mm
+            * np.float32(np.sqrt(np.pi / 2)),  # of a normal error of that expected size
             order_doubt_mm=_pasted(seen, mm_per_rad * TAU * wrong_chance),
         ),
         wrapped_phase_rad=_pasted(seen, seen.phase_rad, np.float32, np.nan),
@@ -436,14 +498,17 @@ def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
 
 
 def _frequency(seen: Observation, across: int) -> Image:
-    """Frequency of the fringe in the image, (h, w), as a multiple of that of a plane square to the camera's axis, which
-    advances by one period every ``period_px`` along the axis ``across`` of the slopes."""
+    """Frequency of the fringe in the image, (h, w), as a multiple of that of a plane square to the
+    camera's axis, which advances by one period every ``period_px`` along the axis ``across`` of the
+    slopes."""
     along = np.abs(TAU / seen.period_px + seen.slopes[across]) * seen.period_px / TAU
     frequency: Image = np.hypot(along, np.abs(seen.slopes[1 - across]) * seen.period_px / TAU)
     return frequency
 
 
-def crossed_nearness(settings: Settings, seen: CrossedObservation, offered: CrossedCandidates) -> Fitted:
+def crossed_nearness(
+    settings: Settings, seen: CrossedObservation, offered: CrossedCandidates
+) -> Fitted:
     """The order of every pixel, and the nearness that follows from it and the frame."""
     order = crossed_order(settings, seen, offered)
     nearness = order.candidates.nearness[1]
@@ -485,8 +550,12 @@ def crossed_depth(model: TwoCarriers, fitted: Fitted) -> Measurement:
         behind_mm = seen.rig.background_m * MM_PER_M - depth_mm
         sigma_mm = np.where(fitted.wall, np.hypot(sigma_mm, behind_mm), sigma_mm)
     window = GaussianWindow(WINDOW_PERIODS * seen.period_px)
-    misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
-    texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (fitted.candidates.misfit_rad[1] > TEXTURE_RAD)
+    misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(
+        fit.weight, 1e-3
+    )
+    texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (
+        fitted.candidates.misfit_rad[1] > TEXTURE_RAD
+    )
     reasons = {
         Reason.ONE_DIRECTION: lost,
         Reason.TEXTURE: texture,

@@ -1,10 +1,11 @@
-"""The empty scene: the background plane's grey levels in the light of an image, which tell what is no object.
+"""The empty scene: the background plane's grey levels in the light of an image, which tell what is
+no object.
 
-The plane's phase is known from the rig, the light is not: it is fitted to the pixels that show the plane. In fringes of
-one direction these are tiles whose grey levels are ambient light plus a multiple of the plane's fringe; the lamp's
-strength found so calibrates the brightness of objects. In crossed fringes they are pixels where both phases are the
-plane's; the lamp's brightness, the contrast, and the response of projector and camera are fitted, and no absolute grey
-level is needed.
+The plane's phase is known from the rig, the light is not: it is fitted to the pixels that show the
+plane. In fringes of one direction these are tiles whose grey levels are ambient light plus a
+multiple of the plane's fringe; the lamp's strength found so calibrates the brightness of objects.
+In crossed fringes they are pixels where both phases are the plane's; the lamp's brightness, the
+contrast, and the response of projector and camera are fitted, and no absolute grey level is needed.
 """
 
 from dataclasses import dataclass
@@ -13,58 +14,80 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.geometry import CalibrationLayer, Carriers, Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.geometry import (
+    CalibrationLayer,
+    Carriers,
+    Crop,
+    Image,
+    Mask,
+    wrapped,
+)
 from fpp_ml_bench.baselines.phase.local_fit import FLOOR_NOISE_GREY, Demodulated
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.optics.rig import Rig
 
 SAMPLE_STEP_PX = 5
 LEAST_SHARE = 0.02  # of the image that must show the plane for the image to calibrate itself
-DARK_PERCENTILE = 1.0  # of the grey levels of an image without background that is taken for its ambient light
+DARK_PERCENTILE = 1.0
+"""Of the grey levels of an image without background that is taken for its ambient light."""
 DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measure it on
 DIFFERENT_SIGMAS = 3.5
-"""A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
+"""A pixel this far from the empty scene is not background; noise alone reaches it at isolated
+pixels, 1 in 2,000."""
 TILE_PX_PER_PERIOD = 1.1
-"""Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
-TILE_NOISE_SIGMAS = 3.0  # largest misfit of a tile that may be background, in standard deviations of the image's noise
+"""Side of the tiles that are searched for the plane: over one period, to separate strength and
+ambient light."""
+TILE_NOISE_SIGMAS = 3.0
+"""Largest misfit of a tile that may be background, in standard deviations of the image's noise."""
 STRENGTH_TOLERANCE = 0.4
-"""Relative deviation of the lamp's strength in an image from a strength that the user gives. A surface in the working
-range whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
+"""Relative deviation of the lamp's strength in an image from a strength that the user gives. A
+surface in the working range whose fringe is in phase with the plane's is two to four times as
+bright, and must not be taken for the plane."""
 LEAST_EXPLAINED = 0.5
-"""Least share of the variance of the tiles' grey levels that one plane must explain. A dark tile in which nothing is to
-be seen misfits no prediction; a plane that is there explains 0.8 and more even where it is as dim as noise."""
-SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
+"""Least share of the variance of the tiles' grey levels that one plane must explain. A dark tile in
+which nothing is to be seen misfits no prediction; a plane that is there explains 0.8 and more even
+where it is as dim as noise."""
+SAME_STRENGTH = 1.35
+"""Ratio of strengths within which tiles show the same surface: sheen changes slowly over a
+plane."""
 SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel may show it
 MOVED_RAD, MOVED_CELLS, MOVED_SHARE = 1.0, 10, 0.1
-"""Farthest distance, along each axis, of the plane's phases from those of the rig: a calibration that is off, or a wall
-that stands elsewhere. Cells along each axis in which it is looked for; share of the image that must agree on it."""
+"""Farthest distance, along each axis, of the plane's phases from those of the rig: a calibration
+that is off, or a wall that stands elsewhere. Cells along each axis in which it is looked for; share
+of the image that must agree on it."""
 CLEAR_SHARE, MORE = 0.5, 1.5
-"""Share of the image that has the rig's own phases from which on no other place is looked for; how many times as many
-points another place must have."""
+"""Share of the image that has the rig's own phases from which on no other place is looked for; how
+many times as many points another place must have."""
 EXACT_RAD = 0.05  # distance that is not corrected
 NARROWING_RAD = (0.3, 0.2, 0.2, 0.2)
-"""Distances from the corrected phases, in place of `SAME_RAD`, round by round: a flat object may be near the plane."""
+"""Distances from the corrected phases, in place of `SAME_RAD`, round by round: a flat object may be
+near the plane."""
 MARGIN_PERIODS = 0.4  # eroded from those pixels: a window beside an object covers it too
-PLAIN_SIGMAS = 5.0  # spread of the plane's fitted light, over the noise, below which it shows no fringe
+PLAIN_SIGMAS = 5.0
+"""Spread of the plane's fitted light, over the noise, below which it shows no fringe."""
 TEXTURED = 3.0
-"""Misfit of the plane over the frame's noise from which on its albedo is taken to change from place to place."""
+"""Misfit of the plane over the frame's noise from which on its albedo is taken to change from place
+to place."""
 ALBEDO_PERIODS, ALBEDO_SIDES = 0.27, 0.5
-"""In periods: sigma of the window in which an albedo is measured, and how far away the albedo of a side is taken."""
+"""In periods: sigma of the window in which an albedo is measured, and how far away the albedo of a
+side is taken."""
 ALBEDO_SHARE = 0.03  # of the plane's light that counts as noise where its albedo changes
 SAMPLES = 4000  # points to which the plane is fitted, about
 ROUNDS = 4
 OUTLIER_SIGMAS = 4.0
 RESPONSE_POWERS = (2, 3)  # of the pattern, whose sum is what a projector of any gamma shows
 CURVE_POWERS = (1, 2, 3)
-"""Powers of the fitted light whose sum is the plane's grey level: a gamma of projector or camera bends it."""
+"""Powers of the fitted light whose sum is the plane's grey level: a gamma of projector or camera
+bends it."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives per 1/m^2 of
-    irradiance, NaN where neither image nor user tells; ``residual`` float32 (H, W): image minus prediction; ``share``:
-    of the tiles that show the plane, 0 for none; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2; ``textured``:
-    the plane's albedo is taken to change from place to place."""
+    """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives
+    per 1/m^2 of irradiance, NaN where neither image nor user tells; ``residual`` float32 (H, W):
+    image minus prediction; ``share``: of the tiles that show the plane, 0 for none; ``weights``: of
+    the lamp's terms 1, x, y, x^2, xy, y^2; ``textured``: the plane's albedo is taken to change from
+    place to place."""
 
     ambient_grey: float
     strength: float
@@ -91,13 +114,14 @@ class Background:
 
 
 class EmptyScene:
-    """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase is
-    calibrated; ambient light, the lamp's strength and a slow change of its sheen across the image are fitted to the
-    pixels that show the plane. ``white_grey`` and ``ambient_grey``, if the user gives them, are a photometric
-    calibration: the grey level of a white pattern on a surface that faces the projector at the near end of the working
-    range, and of a surface in ambient light alone. Without them an image that does not show the plane, or
-    whose rig knows none, is not calibrated, and brightness tells no distance. What is modulated is object there
-    (`modulated_region`)."""
+    """The background plane as a rig and direction show it; computed once, then fitted to every
+    image. Its phase is calibrated; ambient light, the lamp's strength and a slow change of its
+    sheen across the image are fitted to the pixels that show the plane. ``white_grey`` and
+    ``ambient_grey``, if the user gives them, are a photometric calibration: the grey level of a
+    white pattern on a surface that faces the projector at the near end of the working range, and of
+    a surface in ambient light alone. Without them an image that does not show the plane, or whose
+    rig knows none, is not calibrated, and brightness tells no distance. What is modulated is object
+    there (`modulated_region`)."""
 
     def __init__(
         self,
@@ -108,14 +132,18 @@ class EmptyScene:
         ambient_grey: float | None,
     ) -> None:
         self.ambient_grey = ambient_grey
-        self.strength = np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
+        self.strength = (
+            np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
+        )
         self._rays = rig.camera.rays()
         # Without a known background nothing is predicted, and no image shows it.
         depth_m = np.nan if rig.background_m is None else rig.background_m
         self._phase = layer.absolute_phase(depth_m * MM_PER_M)
         self._fall_off = plane_irradiance(rig, depth_m)
         self._light = np.nan_to_num(self._fall_off * (0.5 + 0.5 * np.cos(self._phase)))
-        self._terms = [np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)]
+        self._terms = [
+            np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)
+        ]
         self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), *self._light.shape)
         self._mean, self._square = self._tiles(self._light), self._tiles(self._light * self._light)
 
@@ -125,7 +153,11 @@ class EmptyScene:
         plane_tiles = self._background_tiles(grey)
         share = float(plane_tiles.mean())
         if share < LEAST_SHARE:
-            dark = float(np.percentile(image, DARK_PERCENTILE)) if self.ambient_grey is None else self.ambient_grey
+            dark = (
+                float(np.percentile(image, DARK_PERCENTILE))
+                if self.ambient_grey is None
+                else self.ambient_grey
+            )
             strength = float(np.nan_to_num(self.strength))
             residual = grey - np.float32(dark) - np.float32(strength) * self._terms[0]
             noise = max(image_noise_grey(image), DEFAULT_NOISE_GREY)
@@ -134,18 +166,22 @@ class EmptyScene:
         places = np.nonzero(plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
         row, column = (SAMPLE_STEP_PX * place for place in places)
         sampled = grey[row, column].astype(np.float64)
-        terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
+        terms = np.stack(
+            [np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1
+        )
         fitted, solution = _least_squares(terms, sampled, rounds=1)
         noise = _noise_of(sampled - fitted)
         ambient_grey, *weights = solution
         residual = grey - np.float32(ambient_grey)
         for weight, term in zip(weights, self._terms, strict=True):
             residual -= np.float32(weight) * term
-        return Background(float(ambient_grey), float(weights[0]), noise, residual, share, tuple(weights))
+        return Background(
+            float(ambient_grey), float(weights[0]), noise, residual, share, tuple(weights)
+        )
 
     def predicted(self, background: Background, shift_rad: float, where: Crop) -> Image:
-        """Grey levels, float32 (h, w), that the plane has on the pixels ``where`` of a frame whose fringe is shifted by
-        ``shift_rad``, in the light that ``background`` was fitted to."""
+        """Grey levels, float32 (h, w), that the plane has on the pixels ``where`` of a frame whose
+        fringe is shifted by ``shift_rad``, in the light that ``background`` was fitted to."""
         terms = _quadratic(*(axis[where] for axis in self._rays))
         lamp = sum(weight * term for weight, term in zip(background.weights, terms, strict=False))
         fringe = 0.5 + 0.5 * np.cos(self._phase[where] + shift_rad)
@@ -156,11 +192,16 @@ class EmptyScene:
         """Means over whole tiles."""
         tile = self._tile
         height, width = (length // tile * tile for length in image.shape)
-        rows = image[:height, :width].reshape(height, width // tile, tile).sum(axis=2, dtype=np.float64)
+        rows = (
+            image[:height, :width]
+            .reshape(height, width // tile, tile)
+            .sum(axis=2, dtype=np.float64)
+        )
         return rows.reshape(height // tile, tile, width // tile).sum(axis=1) / (tile * tile)
 
     def _background_tiles(self, grey: Image) -> Mask:
-        """Tiles whose grey levels are ambient light plus a common multiple of the predicted light."""
+        """Tiles whose grey levels are ambient light plus a common multiple of the predicted
+        light."""
         mean, square = self._tiles(grey), self._tiles(grey * grey)
         spread = self._square - self._mean**2
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -168,25 +209,35 @@ class EmptyScene:
             slope = covariance / spread
             misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
             largest = TILE_NOISE_SIGMAS * max(image_noise_grey(grey), 1.0)
-            plane_tiles = (misfit < largest) & (spread > 1e-2 * spread.max()) & (slope * np.sqrt(spread) > largest / 3)
+            plane_tiles = (
+                (misfit < largest)
+                & (spread > 1e-2 * spread.max())
+                & (slope * np.sqrt(spread) > largest / 3)
+            )
             if np.isfinite(self.strength):
                 plane_tiles &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
         if not plane_tiles.any():
             return plane_tiles
         # The plane is the surface with the most tiles of one strength.
         ascending = np.sort(slope[plane_tiles])
-        count = np.searchsorted(ascending, ascending * SAME_STRENGTH, "right") - np.arange(ascending.size)
+        count = np.searchsorted(ascending, ascending * SAME_STRENGTH, "right") - np.arange(
+            ascending.size
+        )
         first = int(count.argmax())
         typical = float(np.median(ascending[first : first + count[first]]))
         plane_tiles &= np.abs(slope / typical - 1) < 0.15
         shown = (square - mean**2)[plane_tiles].sum()
         unexplained = (misfit[plane_tiles] ** 2).sum()
-        return plane_tiles if unexplained < (1 - LEAST_EXPLAINED) * shown else np.zeros_like(plane_tiles)
+        return (
+            plane_tiles
+            if unexplained < (1 - LEAST_EXPLAINED) * shown
+            else np.zeros_like(plane_tiles)
+        )
 
 
 def image_noise_grey(image: NDArray) -> float:
-    """Standard deviation of an image's noise in grey levels, by the median over pixels of a mask that removes planes
-    and slow fringes (Immerkaer 1996, Fast Noise Variance Estimation)."""
+    """Standard deviation of an image's noise in grey levels, by the median over pixels of a mask
+    that removes planes and slow fringes (Immerkaer 1996, Fast Noise Variance Estimation)."""
     grey = image.astype(np.float32)
     across = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
     mask = across[:-2] - 2 * across[1:-1] + across[2:]
@@ -199,7 +250,8 @@ def _noise_of(misfit_grey: NDArray) -> float:
 
 
 def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
-    """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance squared, 1/m^2, (H, W)."""
+    """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance
+    squared, 1/m^2, (H, W)."""
     x, y = rig.camera.rays()
     centre = -rig.R.T @ rig.t
     # The plane's normal is the camera's axis, however the projector is rotated.
@@ -219,15 +271,22 @@ def _linear(rig: Rig) -> NDArray[np.float32]:
 
 
 class CrossedEmptyScene:
-    """The plane of a rig in the light of a carrier pair; computed once, then fitted to every image."""
+    """The plane of a rig in the light of a carrier pair; computed once, then fitted to every
+    image."""
 
     def __init__(self, carriers: Carriers, stride: int) -> None:
-        self._carriers, self._stride, self._known = carriers, stride, carriers.rig.background_m is not None
+        self._carriers, self._stride, self._known = (
+            carriers,
+            stride,
+            carriers.rig.background_m is not None,
+        )
         self._period_px = carriers.period_px
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
         phases = self._phases()
         self._grid_rad = wrapped(phases[:, ::stride, ::stride]).astype(np.float32)
-        self._grid = _linear(carriers.rig)[:, ::stride, ::stride].copy()  # a view would keep the whole image
+        self._grid = _linear(carriers.rig)[
+            :, ::stride, ::stride
+        ].copy()  # a view would keep the whole image
         self._terms = self._light(phases)
 
     @property
@@ -240,10 +299,13 @@ class CrossedEmptyScene:
         return self._carriers.phases(self._carriers.nearness(self._depth_m * MM_PER_M))
 
     def _light(self, phases: NDArray) -> list[Image]:
-        """Terms (H, W) whose weighted sum is the plane's light at ``phases`` (2, H, W): a lamp of uneven brightness,
-        carriers of any contrast, a projector's response, which bends the pattern before the light falls off, and
-        ambient light."""
-        waves = (weight * np.cos(phase) for weight, phase in zip(self._carriers.family.weights, phases, strict=True))
+        """Terms (H, W) whose weighted sum is the plane's light at ``phases`` (2, H, W): a lamp of
+        uneven brightness, carriers of any contrast, a projector's response, which bends the pattern
+        before the light falls off, and ambient light."""
+        waves = (
+            weight * np.cos(phase)
+            for weight, phase in zip(self._carriers.family.weights, phases, strict=True)
+        )
         first, second = (wave.astype(np.float32) for wave in waves)
         fall_off = plane_irradiance(self._carriers.rig, self._depth_m).astype(np.float32)
         fall_off /= np.float32(np.median(fall_off))
@@ -253,26 +315,36 @@ class CrossedEmptyScene:
         return [*terms, fall_off * first, fall_off * second, np.ones_like(x)]
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:
-        """Fit the plane to an image float32 (H, W), demodulated as ``seen``: its ``residual`` float32 (H, W), ambient
-        light and noise, and the ``share`` of the image that shows it, 0 where it is not to be seen. The brightness of a
-        crossed frame tells no distance: `Background.strength` is NaN."""
+        """Fit the plane to an image float32 (H, W), demodulated as ``seen``: its ``residual``
+        float32 (H, W), ambient light and noise, and the ``share`` of the image that shows it, 0
+        where it is not to be seen. The brightness of a crossed frame tells no distance:
+        `Background.strength` is NaN."""
         smooth = cv2.blur(grey, (3, 3))[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
         dark = float(np.percentile(smooth, DARK_PERCENTILE))
         noise = max(image_noise_grey(grey), FLOOR_NOISE_GREY)
         plane_points, moved_rad = self._plane(seen, noise)
         share = float(plane_points.mean())
         if share < LEAST_SHARE:
-            return Background(dark, np.nan, max(noise, DEFAULT_NOISE_GREY), np.zeros_like(grey), 0.0, ())
+            return Background(
+                dark, np.nan, max(noise, DEFAULT_NOISE_GREY), np.zeros_like(grey), 0.0, ()
+            )
         row, column = self._stride * _spread(plane_points)
         samples = grey[row, column].astype(np.float64)
         all_terms = self._terms if moved_rad is None else self._light(self._phases() + moved_rad)
         terms = np.stack([term[row, column] for term in all_terms], axis=1).astype(np.float64)
         light, weights = _least_squares(terms, samples)
         # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
-        first = sum((np.float32(w) * term for w, term in zip(weights, all_terms, strict=True)), np.float32(0))
+        first = sum(
+            (np.float32(w) * term for w, term in zip(weights, all_terms, strict=True)),
+            np.float32(0),
+        )
         own_noise = max(image_noise_grey(grey), DEFAULT_NOISE_GREY)
-        if np.subtract(*np.percentile(light, [95, 5])) < PLAIN_SIGMAS * own_noise:  # no fringe for a gamma to bend
-            return Background(dark, np.nan, max(_noise_of(samples - light), noise), grey - first, share, ())
+        if (
+            np.subtract(*np.percentile(light, [95, 5])) < PLAIN_SIGMAS * own_noise
+        ):  # no fringe for a gamma to bend
+            return Background(
+                dark, np.nan, max(_noise_of(samples - light), noise), grey - first, share, ()
+            )
         curve = np.stack([light**power for power in CURVE_POWERS] + [np.ones_like(light)], axis=1)
         scale = np.maximum(np.abs(curve).max(axis=0), 1e-6)
         fitted, bend = _least_squares(curve / scale, samples)
@@ -284,8 +356,9 @@ class CrossedEmptyScene:
         return Background(dark, np.nan, noise, grey - plane, share, ())
 
     def _of_any_albedo(self, grey: Image, plane: Image, dark: float, noise_grey: float) -> Image:
-        """Misfit of a plane whose albedo changes from place to place, in units of the noise: the fringe of ``plane`` is
-        as bright as the frame says around the pixel, or on one of its sides."""
+        """Misfit of a plane whose albedo changes from place to place, in units of the noise: the
+        fringe of ``plane`` is as bright as the frame says around the pixel, or on one of its
+        sides."""
         light, seen = plane - np.float32(dark), grey - np.float32(dark)
         sigma_px = ALBEDO_PERIODS * self._period_px
         power = cv2.GaussianBlur(light * light, (0, 0), sigma_px)
@@ -294,18 +367,32 @@ class CrossedEmptyScene:
         around = cv2.copyMakeBorder(albedo, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
         height, width = grey.shape
         least = np.full(grey.shape, np.inf, np.float32)
-        for down, right in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+        for down, right in (
+            (0, 0),
+            (-1, 0),
+            (1, 0),
+            (0, -1),
+            (0, 1),
+            (-1, -1),
+            (-1, 1),
+            (1, -1),
+            (1, 1),
+        ):
             y, x = reach * (1 + down), reach * (1 + right)
             misfit = seen - around[y : y + height, x : x + width] * light
             least = np.where(np.abs(misfit) < np.abs(least), misfit, least)
         return least / np.hypot(1, np.float32(ALBEDO_SHARE / noise_grey) * light)
 
     def _plane(self, seen: Demodulated, noise_grey: float) -> tuple[Mask, Image | None]:
-        """Grid points (h', w') whose windows show the plane alone, and by how much its phases are beside the rig's,
-        float32 (2, H, W) in rad, None for at most `EXACT_RAD`. Where its fringes are nowhere to be seen, the points
-        without any fringe: they are blurred out, or there is no wall."""
+        """Grid points (h', w') whose windows show the plane alone, and by how much its phases are
+        beside the rig's, float32 (2, H, W) in rad, None for at most `EXACT_RAD`. Where its fringes
+        are nowhere to be seen, the points without any fringe: they are blurred out, or there is no
+        wall."""
         modulation = seen.modulation
-        fringed, plain = modulation.min(axis=0) > noise_grey / 4, modulation.max(axis=0) < noise_grey / 2
+        fringed, plain = (
+            modulation.min(axis=0) > noise_grey / 4,
+            modulation.max(axis=0) < noise_grey / 2,
+        )
         off_rad = wrapped(seen.phase_rad - self._grid_rad)
         moved_rad = np.zeros((2, 1, 1), np.float32)
         points = self._alone(fringed & (np.hypot(*off_rad) < SAME_RAD))
@@ -325,7 +412,9 @@ class CrossedEmptyScene:
             moved_rad = np.tensordot(slopes, self._grid, 1).astype(np.float32)
             if np.abs(moved_rad).max() < EXACT_RAD:
                 return points, None
-            points = self._alone(fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < tolerance_rad))
+            points = self._alone(
+                fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < tolerance_rad)
+            )
         return points, np.tensordot(slopes, _linear(self._carriers.rig), 1).astype(np.float32)
 
     def _alone(self, points: Mask) -> Mask:
@@ -352,7 +441,8 @@ def _most_common(off_rad: NDArray) -> NDArray[np.float32]:
 def _least_squares(
     terms: NDArray[np.float64], values: NDArray[np.float64], rounds: int = ROUNDS
 ) -> tuple[NDArray, NDArray]:
-    """Least squares, in more than one of the ``rounds`` without outliers: the fitted values and the solution."""
+    """Least squares, in more than one of the ``rounds`` without outliers: the fitted values and the
+    solution."""
     keep = np.ones(len(values), bool)
     fitted: NDArray = values
     solution: NDArray = values

@@ -1,19 +1,22 @@
-"""The geometry of one carrier and of two: from phase and fringe order to depth, in closed form, for any rig.
+"""The geometry of one carrier and of two: from phase and fringe order to depth, in closed form, for
+any rig.
 
-With ``a = R (x, y, 1)`` the projector sees the pixel's point at ``(Z a_i + t_i) / (Z a_2 + t_2)``, and
-the point at infinity at ``a_i / a_2``. The residual phase is the absolute phase minus that of the point at infinity,
-``psi = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2)``, for the paper's rig ``-2 pi f_p C / (P Z)``. It varies
-as slowly as 1 / Z does, and gives depth back without subtracting large numbers, so that float32 is enough.
+With ``a = R (x, y, 1)`` the projector sees the pixel's point at ``(Z a_i + t_i) / (Z a_2 + t_2)``,
+and the point at infinity at ``a_i / a_2``. The residual phase is the absolute phase minus that of
+the point at infinity, ``psi = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2)``, for the
+paper's rig ``-2 pi f_p C / (P Z)``. It varies as slowly as 1 / Z does, and gives depth back without
+subtracting large numbers, so that float32 is enough.
 
-Two carriers share the *nearness* ``q = 1 / (Z a_2 + t_2)``, for a projector beside the camera 1 / Z: without lens
-distortion every projector coordinate is affine in it, so that carrier k shows ``phase_k = infinity_k + gain_k q``. A
-lens bends that by a hundredth of a projector px over a working range; `Carriers.depth_mm` corrects it.
+Two carriers share the *nearness* ``q = 1 / (Z a_2 + t_2)``, for a projector beside the camera 1 /
+Z: without lens distortion every projector coordinate is affine in it, so that carrier k shows
+``phase_k = infinity_k + gain_k q``. A lens bends that by a hundredth of a projector px over a
+working range; `Carriers.depth_mm` corrects it.
 
-Windows, steps of the grid of orders and filters of a network have a size in pixels of the fringe. So an image whose
-fringe period is far from the one that a method was made for is resampled, and what is measured is sampled back
-(`Resampling`): one with a period of 116 px is measured at 22.6 px, and a network that learnt from 22.6 px gets an image
-of 6 px enlarged. A longer period loses nothing: a local fit averages over a quarter of it anyway, and the image is
-shrunk by averaging.
+Windows, steps of the grid of orders and filters of a network have a size in pixels of the fringe.
+So an image whose fringe period is far from the one that a method was made for is resampled, and
+what is measured is sampled back (`Resampling`): one with a period of 116 px is measured at 22.6 px,
+and a network that learnt from 22.6 px gets an image of 6 px enlarged. A longer period loses
+nothing: a local fit averages over a quarter of it anyway, and the image is shrunk by averaging.
 """
 
 from collections.abc import Callable, Iterable
@@ -39,9 +42,11 @@ Mask = NDArray[np.bool_]
 Crop = tuple[slice, slice]
 
 LEAST_RANGE_RAD = 1.0
-"""Least change of the joint phase over the working range for crossed fringes to tell a depth at all."""
+"""Least change of the joint phase over the working range for crossed fringes to tell a depth at
+all."""
 RESAMPLED_JUMP_RAD = 1.0
-"""Difference of residual phase from which on a pixel lies beside a jump, and nothing is interpolated."""
+"""Difference of residual phase from which on a pixel lies beside a jump, and nothing is
+interpolated."""
 CLIPPED_SHARE = 0.1
 """Of an averaged pixel: what makes it saturated."""
 NODES_PER_PERIOD = 7.5
@@ -55,8 +60,9 @@ def wrapped(phase_rad: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class Orders:
-    """Orders whose depth lies in the working range: ``first, first + 1, ..., first + count - 1``, int32 (H, W) each;
-    where none does, ``count`` is 0, and ``first`` is the order nearest to the range's middle."""
+    """Orders whose depth lies in the working range: ``first, first + 1, ..., first + count - 1``,
+    int32 (H, W) each; where none does, ``count`` is 0, and ``first`` is the order nearest to the
+    range's middle."""
 
     first: NDArray[np.int32]
     count: NDArray[np.int32]
@@ -64,11 +70,13 @@ class Orders:
 
 @dataclass(frozen=True)
 class CalibrationLayer:
-    """Constants of one rig and fringe direction for every pixel: float64 maps of the image's shape, or torch tensors.
-    ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, as wrapped
-    phase and order. ``gain`` rad m, ``forward`` = a_2, ``back_m`` = t_2: psi = gain / (forward Z + back_m).
-    ``rad_per_unit``: phase of one normalised projector unit along u and along v, 2 pi f_p / P and 0 for fringes of one
-    direction. Of a projector whose lens distorts, its coefficients ``lens``, t in metres, and ``rays``: the maps a."""
+    """Constants of one rig and fringe direction for every pixel: float64 maps of the image's shape,
+    or torch tensors. ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a
+    point infinitely far away, as wrapped phase and order. ``gain`` rad m, ``forward`` = a_2,
+    ``back_m`` = t_2: psi = gain / (forward Z + back_m). ``rad_per_unit``: phase of one normalised
+    projector unit along u and along v, 2 pi f_p / P and 0 for fringes of one direction. Of a
+    projector whose lens distorts, its coefficients ``lens``, t in metres, and ``rays``: the maps
+    a."""
 
     infinity_rad: Any
     infinity_order: Any
@@ -82,17 +90,21 @@ class CalibrationLayer:
 
     @classmethod
     def of(cls, rig: Rig, direction: Direction, rays: Maps | None = None) -> "CalibrationLayer":
-        """The layer of ``rig`` for ``direction`` at all its camera's pixels, or at normalised ``rays`` (x, y). Raises
-        `DecodeError` for an unknown direction."""
+        """The layer of ``rig`` for ``direction`` at all its camera's pixels, or at normalised
+        ``rays`` (x, y). Raises `DecodeError` for an unknown direction."""
         if direction not in DIRECTIONS:
             raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
         frequency = 1 / rig.pitch(direction)
-        return cls.of_carrier(rig, (frequency, 0.0) if direction == "vertical" else (0.0, frequency), rays)
+        return cls.of_carrier(
+            rig, (frequency, 0.0) if direction == "vertical" else (0.0, frequency), rays
+        )
 
     @classmethod
-    def of_carrier(cls, rig: Rig, cycles_per_px: tuple[float, float], rays: Maps | None = None) -> "CalibrationLayer":
-        """The layer of a fringe of any angle, with frequencies (f_u, f_v) in cycles a projector px, as those of
-        `coding.Crossed.cycles_per_px`; its phase is 2 pi (f_u u + f_v v)."""
+    def of_carrier(
+        cls, rig: Rig, cycles_per_px: tuple[float, float], rays: Maps | None = None
+    ) -> "CalibrationLayer":
+        """The layer of a fringe of any angle, with frequencies (f_u, f_v) in cycles a projector px,
+        as those of `coding.Crossed.cycles_per_px`; its phase is 2 pi (f_u u + f_v v)."""
         where, device = rig.camera.rays() if rays is None else rays, rig.projector
         a = (rotated_ray(where, rig, 0), rotated_ray(where, rig, 1), rotated_ray(where, rig, 2))
         along_u, along_v = cycles_per_px
@@ -104,50 +116,71 @@ class CalibrationLayer:
                 infinity = infinity + per_unit * (a[axis] / a[2])
                 gain = gain + per_unit * (rig.t[axis] - rig.t[2] * a[axis] / a[2])
         order = np.floor(infinity / TAU + 0.5)
-        maps = infinity - TAU * order, order, gain, a[2], float(rig.t[2]), rad_per_unit, rig.translation_m
+        maps = (
+            infinity - TAU * order,
+            order,
+            gain,
+            a[2],
+            float(rig.t[2]),
+            rad_per_unit,
+            rig.translation_m,
+        )
         distorts = device.is_distorted and is_distorted(device.distortion)
         return cls(*maps, device.distortion, a) if distorts else cls(*maps)
 
     @property
     def maps(self) -> tuple[Any, ...]:
-        """All maps: the four of the pinhole model, and the rays where the projector's lens distorts."""
+        """All maps: the four of the pinhole model, and the rays where the projector's lens
+        distorts."""
         return (self.infinity_rad, self.infinity_order, self.gain, self.forward, *self.rays)
 
     def with_maps(self, maps: Iterable[Any]) -> "CalibrationLayer":
         """The same constants with other ``maps``, in the order of `maps`."""
         infinity, order, gain, forward, *rays = maps
-        return replace(self, infinity_rad=infinity, infinity_order=order, gain=gain, forward=forward, rays=tuple(rays))
+        return replace(
+            self,
+            infinity_rad=infinity,
+            infinity_order=order,
+            gain=gain,
+            forward=forward,
+            rays=tuple(rays),
+        )
 
     def at(self, where: Any) -> "CalibrationLayer":
         """The layer of a part of the image: ``where`` indexes the maps (slices, a mask)."""
         return self.with_maps(values[where] for values in self.maps)
 
     def tensors(self, dtype: Any = None, device: Any = None) -> "CalibrationLayer":
-        """The layer on torch tensors; gradients flow through depth to the phase. ``dtype`` float32 (None) keeps a
-        micrometre; float64 equals the NumPy layer to 1e-6 mm."""
+        """The layer on torch tensors; gradients flow through depth to the phase. ``dtype`` float32
+        (None) keeps a micrometre; float64 equals the NumPy layer to 1e-6 mm."""
         import torch
 
-        return self.with_maps(torch.tensor(m, dtype=dtype or torch.float32, device=device) for m in self.maps)
+        return self.with_maps(
+            torch.tensor(m, dtype=dtype or torch.float32, device=device) for m in self.maps
+        )
 
     def residual_phase(self, phase_rad: Any, order: Any) -> Any:
-        """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are subtracted, then whole
-        periods counted, so that float32 keeps its digits."""
+        """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are
+        subtracted, then whole periods counted, so that float32 keeps its digits."""
         return (phase_rad - self.infinity_rad) + TAU * (order - self.infinity_order)
 
     def absolute_phase(self, depth_mm: ArrayLike) -> NDArray[np.float64]:
-        """Absolute phase Phi in rad that a point at ``depth_mm`` on each pixel's ray shows, float64 (NumPy only)."""
+        """Absolute phase Phi in rad that a point at ``depth_mm`` on each pixel's ray shows, float64
+        (NumPy only)."""
         residual = self.residual_of_depth(np.asarray(depth_mm, dtype=np.float64))
         return residual + self.infinity_rad + TAU * self.infinity_order  # type: ignore[no-any-return]
 
     def residual_of_depth(self, depth_mm: Any) -> Any:
-        """psi in rad of a point at ``depth_mm`` on each pixel's ray: an array or a tensor, as the maps."""
+        """psi in rad of a point at ``depth_mm`` on each pixel's ray: an array or a tensor, as the
+        maps."""
         z = depth_mm / MM_PER_M
         residual = self.gain / (self.forward * z + self.back_m)
         return residual if self.lens is None else residual + self._lens_shift(z)
 
     def depth_mm(self, phase_rad: Any, order: Any) -> Any:
-        """Depth in mm, the camera's z, from wrapped phase in rad and fringe order: arrays or tensors of the maps' shape
-        (leading dimensions may be more). Not bounded: a point behind a device gets a negative or infinite depth."""
+        """Depth in mm, the camera's z, from wrapped phase in rad and fringe order: arrays or
+        tensors of the maps' shape (leading dimensions may be more). Not bounded: a point behind a
+        device gets a negative or infinite depth."""
         return self.depth_of_residual_mm(self.residual_phase(phase_rad, order))
 
     def depth_of_residual_mm(self, residual_rad: Any) -> Any:
@@ -155,7 +188,9 @@ class CalibrationLayer:
         ideal = residual_rad
         if self.lens is not None:
             for _ in range(FIXED_POINT_STEPS):
-                ideal = residual_rad - self._lens_shift((self.gain / ideal - self.back_m) / self.forward)
+                ideal = residual_rad - self._lens_shift(
+                    (self.gain / ideal - self.back_m) / self.forward
+                )
         return (self.gain / ideal - self.back_m) / self.forward * MM_PER_M
 
     def _lens_shift(self, z: Any) -> Any:
@@ -167,7 +202,8 @@ class CalibrationLayer:
         return sum(per_unit * (after - before) for per_unit, after, before in shifts if per_unit)
 
     def orders_in_range(self, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Orders:
-        """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN phases have none."""
+        """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN
+        phases have none."""
         phase = np.asarray(phase_rad, dtype=np.float64)
         ends = [self.absolute_phase(end) for end in range_mm]
         low, high = np.minimum(*ends), np.maximum(*ends)
@@ -181,9 +217,10 @@ class CalibrationLayer:
 
 @dataclass(frozen=True)
 class Carriers:
-    """The two carriers of ``rig`` at the pixels ``crop`` of its image. ``infinity_rad`` float32 (2, h, w), wrapped;
-    ``gain`` float32 (2, h, w), rad m; ``forward`` float32 (h, w) and ``back_m``: a_2 and t_2; ``step_rad`` (2, 2):
-    change of each phase per px along x and y, on a plane at the standoff."""
+    """The two carriers of ``rig`` at the pixels ``crop`` of its image. ``infinity_rad`` float32 (2,
+    h, w), wrapped; ``gain`` float32 (2, h, w), rad m; ``forward`` float32 (h, w) and ``back_m``:
+    a_2 and t_2; ``step_rad`` (2, 2): change of each phase per px along x and y, on a plane at the
+    standoff."""
 
     rig: Rig
     family: Crossed
@@ -196,7 +233,8 @@ class Carriers:
 
     @classmethod
     def of(cls, rig: Rig, family: Crossed) -> "Carriers":
-        """The carriers of a whole image. Raises `PredictionError` for carriers that hardly change with depth."""
+        """The carriers of a whole image. Raises `PredictionError` for carriers that hardly change
+        with depth."""
         x, y = rig.camera.rays()
         forward, back_m = rotated_ray((x, y), rig, 2), float(rig.t[2])
         ends_m = [depth_mm / MM_PER_M for depth_mm in rig.working_range_mm]
@@ -205,7 +243,9 @@ class Carriers:
         gain = (near_rad - far_rad) / (near_q - far_q)
         infinity = near_rad - gain * near_q
         standoff = infinity + gain / (forward * rig.standoff_m + back_m)
-        step = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)] for phase in standoff])
+        step = np.array(
+            [[np.diff(phase, axis=axis).mean() for axis in (1, 0)] for phase in standoff]
+        )
         everywhere = slice(None), slice(None)
         carriers = cls(
             rig,
@@ -220,8 +260,10 @@ class Carriers:
         span = float(np.median(carriers.joint_gain * np.abs(near_q - far_q)))
         if not span >= LEAST_RANGE_RAD:
             raise PredictionError(
-                f"crossed: over the working range {rig.working_range_mm[0]:g} to {rig.working_range_mm[1]:g} mm the "
-                f"carriers change by {span:.2g} rad, too little for a depth: turn them towards the line between camera "
+                f"crossed: over the working range {rig.working_range_mm[0]:g} to "
+                f"{rig.working_range_mm[1]:g} mm the "
+                f"carriers change by {span:.2g} rad, too little for a depth: turn them towards the "
+                f"line between camera "
                 "and projector, or make them finer (fpp-bench patterns --design)"
             )
         return carriers
@@ -233,7 +275,8 @@ class Carriers:
 
     @property
     def period_px(self) -> float:
-        """Image px a period of the longer carrier, on a plane at the standoff: windows have a size in it."""
+        """Image px a period of the longer carrier, on a plane at the standoff: windows have a size
+        in it."""
         return float((TAU / np.linalg.norm(self.step_rad, axis=1)).max())
 
     @cached_property
@@ -250,8 +293,8 @@ class Carriers:
         return 1 / (self.forward * np.asarray(depth_mm) / MM_PER_M + self.back_m)
 
     def depth_mm(self, nearness: NDArray) -> NDArray[np.float64]:
-        """Depth in mm, float64 (h, w), from q; corrected for a projector lens that distorts. NaN where q is not in
-        front of both devices."""
+        """Depth in mm, float64 (h, w), from q; corrected for a projector lens that distorts. NaN
+        where q is not in front of both devices."""
         q = nearness.astype(np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth_m = np.where(q > 0, (1 / q - self.back_m) / self.forward, np.nan)
@@ -269,13 +312,19 @@ class Carriers:
         return np.abs(ahead**2 / (self.joint_gain * self.forward)) * MM_PER_M
 
 
-def _phases(rig: Rig, family: Crossed, x: NDArray, y: NDArray, depth_m: ArrayLike) -> NDArray[np.float64]:
-    """Phases (2, h, w) in rad, not wrapped, of points ``depth_m`` away on the rays (x, y), by the rig's own projection;
-    those of the family's first frame."""
-    u, v = rig.project(np.stack([x * depth_m, y * depth_m, np.broadcast_to(depth_m, x.shape)], axis=-1))
+def _phases(
+    rig: Rig, family: Crossed, x: NDArray, y: NDArray, depth_m: ArrayLike
+) -> NDArray[np.float64]:
+    """Phases (2, h, w) in rad, not wrapped, of points ``depth_m`` away on the rays (x, y), by the
+    rig's own projection; those of the family's first frame."""
+    u, v = rig.project(
+        np.stack([x * depth_m, y * depth_m, np.broadcast_to(depth_m, x.shape)], axis=-1)
+    )
     shifts = np.radians(family.shifts_deg[0])
     pairs = zip(family.cycles_per_px, shifts, strict=True)
-    return np.stack([TAU * (along_u * u + along_v * v) + shift for (along_u, along_v), shift in pairs])
+    return np.stack(
+        [TAU * (along_u * u + along_v * v) + shift for (along_u, along_v), shift in pairs]
+    )
 
 
 def stride_of(period_px: float) -> int:
@@ -289,13 +338,14 @@ def grid_of(stride: int, crop: Crop = (slice(None), slice(None))) -> Crop:
 
 
 def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:
-    """Maps (..., h', w') of every ``stride``-th pixel as maps of all (..., h, w); ``shape`` (..., h, w)."""
+    """Maps (..., h', w') of every ``stride``-th pixel as maps of all (..., h, w); ``shape`` (...,
+    h, w)."""
     return coarse.repeat(stride, axis=-2).repeat(stride, axis=-1)[..., : shape[-2], : shape[-1]]
 
 
 def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns (h, w) of the pixel of ``inside`` that is nearest to every pixel; every pixel's own where
-    ``inside`` has none."""
+    """Rows and columns (h, w) of the pixel of ``inside`` that is nearest to every pixel; every
+    pixel's own where ``inside`` has none."""
     if inside.all() or not inside.any():
         places: NDArray = np.indices(inside.shape)
     else:
@@ -305,8 +355,9 @@ def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class Periods:
-    """Fringe periods in image px: from ``shortest`` to ``longest`` an image stays as it is; beyond it is resampled to a
-    period of ``best``. The defaults are those of the phase route, whose constants were chosen at 22.56 px."""
+    """Fringe periods in image px: from ``shortest`` to ``longest`` an image stays as it is; beyond
+    it is resampled to a period of ``best``. The defaults are those of the phase route, whose
+    constants were chosen at 22.56 px."""
 
     shortest: float = 0.0
     best: float = 22.56
@@ -315,8 +366,8 @@ class Periods:
 
 @dataclass(frozen=True)
 class Resampling:
-    """From the images of ``captured`` to those of ``rig``, the same rig with a camera of another size, and back; equal
-    rigs where nothing is to be done."""
+    """From the images of ``captured`` to those of ``rig``, the same rig with a camera of another
+    size, and back; equal rigs where nothing is to be done."""
 
     captured: Rig
     rig: Rig
@@ -327,10 +378,18 @@ class Resampling:
         camera = rig.camera
         if periods.shortest <= seen_px <= periods.longest:
             return cls(rig, rig)
-        width, height = (max(1, round(length * periods.best / seen_px)) for length in (camera.width, camera.height))
+        width, height = (
+            max(1, round(length * periods.best / seen_px))
+            for length in (camera.width, camera.height)
+        )
         # Rounding to whole pixels makes the scales of width and height a little different.
         down = height / camera.height
-        resized = replace(camera.scaled(width), height=height, fy=camera.fy * down, cy=(camera.cy + 0.5) * down - 0.5)
+        resized = replace(
+            camera.scaled(width),
+            height=height,
+            fy=camera.fy * down,
+            cy=(camera.cy + 0.5) * down - 0.5,
+        )
         return cls(rig, replace(rig, camera=resized))
 
     @property
@@ -338,13 +397,16 @@ class Resampling:
         return self.captured is not self.rig
 
     def image(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Captured grey levels uint8 (H, W) in the size of ``rig``; a pixel stays saturated where a part of it is."""
+        """Captured grey levels uint8 (H, W) in the size of ``rig``; a pixel stays saturated where a
+        part of it is."""
         if not self.needed:
             return grey
         size = self.rig.camera.width, self.rig.camera.height
         if size[0] > grey.shape[1]:
             return cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)  # type: ignore[return-value]
-        clipped = cv2.resize((grey == GREY_LEVELS).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        clipped = cv2.resize(
+            (grey == GREY_LEVELS).astype(np.float32), size, interpolation=cv2.INTER_AREA
+        )
         resized = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         return np.where(clipped > CLIPPED_SHARE, np.uint8(GREY_LEVELS), resized)
 
@@ -360,15 +422,18 @@ class Resampling:
         whole, part = self.captured.camera, self.rig.camera
         rows, columns = (
             slice(place.start * full // less, -(-place.stop * full // less))
-            for place, full, less in zip(crop, (whole.height, whole.width), (part.height, part.width), strict=True)
+            for place, full, less in zip(
+                crop, (whole.height, whole.width), (part.height, part.width), strict=True
+            )
         )
         return rows, columns
 
     def restored(
         self, psi: NDArray[np.float64], inside: Mask
     ) -> tuple[Mask, NDArray[np.float64], Callable[[NDArray], NDArray]]:
-        """A phase in rad without wraps, (h, w), at the captured pixels: where they are object, the phase (H, W), and
-        how any map is taken from the nearest object pixel. The phase is interpolated, but not across jumps."""
+        """A phase in rad without wraps, (h, w), at the captured pixels: where they are object, the
+        phase (H, W), and how any map is taken from the nearest object pixel. The phase is
+        interpolated, but not across jumps."""
         size = self.captured.camera.width, self.captured.camera.height
         places = nearest_inside(inside)
 
@@ -377,7 +442,10 @@ class Resampling:
             return cv2.resize(image[places], size, interpolation=cv2.INTER_NEAREST_EXACT)
 
         psi = np.where(inside, psi, 0.0)
-        weight, total = (cv2.resize(v, size, interpolation=cv2.INTER_LINEAR) for v in (inside.astype(np.float64), psi))
+        weight, total = (
+            cv2.resize(v, size, interpolation=cv2.INTER_LINEAR)
+            for v in (inside.astype(np.float64), psi)
+        )
         # A pixel that mixes two surfaces takes the phase of the nearest one.
         lowest, highest = (
             cv2.morphologyEx(np.where(inside, psi, beyond), operation, np.ones((3, 3), np.uint8))
@@ -385,4 +453,8 @@ class Resampling:
         )
         step = np.subtract(highest, lowest, out=np.zeros_like(psi), where=inside)
         beside_jump = nearest((step > RESAMPLED_JUMP_RAD).astype(np.uint8)) > 0
-        return weight > 0.5, np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6)), nearest
+        return (
+            weight > 0.5,
+            np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6)),
+            nearest,
+        )

@@ -1,15 +1,17 @@
 """Least squares of fringes under a Gaussian window, which never reaches across the object mask.
 
-One direction: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a carrier (a plane at
-the standoff) whose phase the solution corrects by ``atan2(-S, C)`` (`carrier_fit`). Two directions: a quadratic
-brightness and both carriers, ``I = p(x, y) + sum_k Re(z_k exp(i k_k (x, y)))``. The solution z_k is a fixed combination
-of grey levels, the same at every pixel, so that it is computed with Fourier transforms, and only where it is needed:
-the filter's band is narrow, and its part of the spectrum, transformed back alone, gives z_k on a grid of every
-``stride``-th pixel (`Demodulator`).
+One direction: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a
+carrier (a plane at the standoff) whose phase the solution corrects by ``atan2(-S, C)``
+(`carrier_fit`). Two directions: a quadratic brightness and both carriers, ``I = p(x, y) + sum_k
+Re(z_k exp(i k_k (x, y)))``. The solution z_k is a fixed combination of grey levels, the same at
+every pixel, so that it is computed with Fourier transforms, and only where it is needed: the
+filter's band is narrow, and its part of the spectrum, transformed back alone, gives z_k on a grid
+of every ``stride``-th pixel (`Demodulator`).
 
-Then, for any number of directions and frames, ``I - ambient = g raised(phase + d)``, with g a polynomial and d one
-change of phase (`tied_fit`). A projected fringe goes down to black, so its mean and its modulation are the same number
-g; with that constraint a slope of brightness is not taken for phase.
+Then, for any number of directions and frames, ``I - ambient = g raised(phase + d)``, with g a
+polynomial and d one change of phase (`tied_fit`). A projected fringe goes down to black, so its
+mean and its modulation are the same number g; with that constraint a slope of brightness is not
+taken for phase.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -26,18 +28,24 @@ from fpp_ml_bench.constants import MAD_TO_SIGMA
 WINDOW_SIGMAS = 3.0
 RIDGE = 1e-6  # of the window's weight, added to the diagonal: fits of a few pixels stay finite
 LARGEST_STEP_RAD = 0.7  # largest change of the phase: beyond it the linear model does not hold
-WHOLE_WINDOW = 0.9  # share of a window that lies on the object, of the pixels on which contrast is measured
+WHOLE_WINDOW = 0.9
+"""Share of a window that lies on the object, of the pixels on which contrast is measured."""
 LEAST_CONTRAST = 0.3
 STEEPEST_RAD_PER_PX = 0.5
-"""Largest change of the residual phase a px that counts as slope; the carrier itself changes by 0.28."""
+"""Largest change of the residual phase a px that counts as slope; the carrier itself changes by
+0.28."""
 DEMODULATION_PERIODS = 0.4  # sigma of the demodulator's window, in periods of the longer carrier
 FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
 REACH_PX = 2  # of the pairs that are averaged
 SAME_PLANE_SIGMAS = 3.0
-WEAK_SIGMAS = 10.0  # modulation around a pixel, in sigmas of its noise, below which it is not measured alone
-WEAK_PHASE_PX, WEAK_LIGHT_PX = 2.0, 1.25  # sigmas of the averages, for phase and order, and for the mask
-SIDES, SIDE_PERIODS = 8, (0.25, 0.5, 0.75)  # neighbours that are asked: directions, and distances in periods
-SIDE_WINDOW_PX, SIDE_SLOPE_PX = 2.0, 3.0  # sigmas of the window in which offers are compared, and of their slopes
+WEAK_SIGMAS = 10.0
+"""Modulation around a pixel, in sigmas of its noise, below which it is not measured alone."""
+WEAK_PHASE_PX, WEAK_LIGHT_PX = 2.0, 1.25
+"""Sigmas of the averages, for phase and order, and for the mask."""
+SIDES, SIDE_PERIODS = 8, (0.25, 0.5, 0.75)
+"""Neighbours that are asked: directions, and distances in periods."""
+SIDE_WINDOW_PX, SIDE_SLOPE_PX = 2.0, 3.0
+"""Sigmas of the window in which offers are compared, and of their slopes."""
 SIDE_SHARE = 0.08  # of the brightness that counts as noise there
 SIDE_CAP = 16.0  # most that the misfit of one pixel counts, in squared sigmas
 SIDE_COST = 0.5  # of an offer from a period away
@@ -60,17 +68,19 @@ class GaussianWindow:
         self._kernels = [(weight * t**power).astype(np.float64) for power in range(5)]
 
     def moment(self, image: Image, along_x: int = 0, along_y: int = 0) -> Image:
-        """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image. In
-        the image's precision, single or double."""
+        """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0
+        beyond the image. In the image's precision, single or double."""
         kernels = self._kernels
-        return cv2.sepFilter2D(image, -1, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT)  # type: ignore[return-value]
+        return cv2.sepFilter2D(
+            image, -1, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT
+        )  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
 class FringeFit:
-    """``phase_rad`` float32 (H, W), not wrapped: carrier plus correction; ``brightness`` g, grey levels (a white
-    pattern's is twice as much); ``weight``: share of the window that lies on the object; ``contrast`` of the fringes,
-    modulation over mean."""
+    """``phase_rad`` float32 (H, W), not wrapped: carrier plus correction; ``brightness`` g, grey
+    levels (a white pattern's is twice as much); ``weight``: share of the window that lies on the
+    object; ``contrast`` of the fringes, modulation over mean."""
 
     phase_rad: Image
     brightness: Image
@@ -84,13 +94,15 @@ class FringeFit:
 
     @property
     def light(self) -> Image:
-        """Grey levels (H, W) of the fitted fringe, without the ambient light, in the first frame."""
+        """Grey levels (H, W) of the fitted fringe, without the ambient light, in the first
+        frame."""
         return np.maximum(self.brightness, 0) * self.raised
 
 
 def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
-    """Solve one small symmetric system a pixel by elimination without pivoting; ``rows``: from the diagonal on. Both
-    arguments are overwritten. The windows' normal matrices are positive; `RIDGE` keeps them so in float32."""
+    """Solve one small symmetric system a pixel by elimination without pivoting; ``rows``: from the
+    diagonal on. Both arguments are overwritten. The windows' normal matrices are positive; `RIDGE`
+    keeps them so in float32."""
     size = len(right)
     ridge = RIDGE * rows[0][0] + np.float32(1e-9)
     for row in rows:
@@ -108,9 +120,11 @@ def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
     return right
 
 
-def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: GaussianWindow) -> tuple[Image, Image]:
-    """Phase in rad and modulation in grey levels, float32 (H, W), from the five-term fit of ``grey`` around each pixel;
-    use them inside only."""
+def carrier_fit(
+    grey: Image, inside: Mask, carrier_rad: NDArray, window: GaussianWindow
+) -> tuple[Image, Image]:
+    """Phase in rad and modulation in grey levels, float32 (H, W), from the five-term fit of
+    ``grey`` around each pixel; use them inside only."""
     weight = inside.astype(np.float32)
     light = grey * weight
     cosine, sine = np.cos(carrier_rad).astype(np.float32), np.sin(carrier_rad).astype(np.float32)
@@ -124,7 +138,9 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Gaussia
         [cc, m(by_cosine * sine)],
         [w00 - cc],
     ]
-    answer = solve_symmetric(rows, [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)])
+    answer = solve_symmetric(
+        rows, [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)]
+    )
     phase: Image = (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
     return phase, np.hypot(answer[3], answer[4])
 
@@ -135,11 +151,12 @@ def tied_fit(
     window: GaussianWindow,
     terms: Sequence[tuple[int, int]],
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Fit of ``light = g raised + s slope`` around each pixel of one or several ``views``, each light (grey levels
-    less ambient light), and light over brightness with its change by the phase, (h, w). Brightness g, the polynomial of
-    ``terms`` at the pixel; s, brightness times change of phase; share of the window on the object; mean square of the
-    slopes times that share."""
-    # The moments of more terms than a plane's are too much alike for the elimination in single precision.
+    """Fit of ``light = g raised + s slope`` around each pixel of one or several ``views``, each
+    light (grey levels less ambient light), and light over brightness with its change by the phase,
+    (h, w). Brightness g, the polynomial of ``terms`` at the pixel; s, brightness times change of
+    phase; share of the window on the object; mean square of the slopes times that share."""
+    # The moments of more terms than a plane's are too much alike for the elimination in single
+    # precision.
     weight: NDArray = inside.astype(np.float32 if len(terms) <= len(PLANE) else np.float64)
     rr: NDArray
     rr = rs = ss = lr = ls = np.zeros_like(weight)
@@ -149,7 +166,10 @@ def tied_fit(
         lr, ls = lr + light * by_raised, ls + light * by_slope
     m = window.moment
     power = m(ss)
-    rows = [[m(rr, a + c, b + d) for c, d in terms[i:]] + [m(rs, a, b)] for i, (a, b) in enumerate(terms)] + [[power]]
+    rows = [
+        [m(rr, a + c, b + d) for c, d in terms[i:]] + [m(rs, a, b)]
+        for i, (a, b) in enumerate(terms)
+    ] + [[power]]
     g, *_, s = solve_symmetric(rows, [m(lr, a, b) for a, b in terms] + [m(ls)])
     return g, s, m(weight), power
 
@@ -164,48 +184,70 @@ def fringe_fit(
     contrast: float = 1.0,
     terms: Sequence[tuple[int, int]] = PLANE,
 ) -> FringeFit:
-    """`tied_fit` of g (1 + c cos(carrier + shift + d)), c the ``contrast``, around each pixel of ``greys``, float32
-    (H, W) each: one image, or several whose fringes are shifted by ``shifts_rad``."""
+    """`tied_fit` of g (1 + c cos(carrier + shift + d)), c the ``contrast``, around each pixel of
+    ``greys``, float32 (H, W) each: one image, or several whose fringes are shifted by
+    ``shifts_rad``."""
     real: type = np.float32 if len(terms) <= len(PLANE) else np.float64
 
     def view(grey: Image, shift: float) -> tuple[NDArray, NDArray, NDArray]:
         angle = carrier_rad.astype(real) + real(shift)
-        return grey - real(ambient), 1 + real(contrast) * np.cos(angle), -real(contrast) * np.sin(angle)
+        return (
+            grey - real(ambient),
+            1 + real(contrast) * np.cos(angle),
+            -real(contrast) * np.sin(angle),
+        )
 
     views = (view(grey, shift) for grey, shift in zip(greys, shifts_rad, strict=True))
     g, s, share, _ = tied_fit(views, inside, window, terms)
     step = np.clip(s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
-    return FringeFit((carrier_rad + step).astype(np.float32), g.astype(np.float32), share.astype(np.float32), contrast)
+    return FringeFit(
+        (carrier_rad + step).astype(np.float32),
+        g.astype(np.float32),
+        share.astype(np.float32),
+        contrast,
+    )
 
 
 def measured_contrast(light: Image, inside: Mask, fit: FringeFit) -> float:
-    """Modulation over mean of the fringes of ``light`` (grey levels less the ambient light), over the pixels whose
-    window lies on the object: the contrast with which the phase and brightness of ``fit`` explain them best."""
+    """Modulation over mean of the fringes of ``light`` (grey levels less the ambient light), over
+    the pixels whose window lies on the object: the contrast with which the phase and brightness of
+    ``fit`` explain them best."""
     fringe, whole = np.cos(fit.phase_rad), inside & (fit.weight > WHOLE_WINDOW)
     varies = np.clip(light / np.maximum(fit.brightness, 1.0) - 1, -1, 1)
     power = float((fringe**2).sum(where=whole, dtype=np.float64))
     if power == 0:
         return fit.contrast
-    return float(np.clip((fringe * varies).sum(where=whole, dtype=np.float64) / power, LEAST_CONTRAST, 1.0))
+    return float(
+        np.clip((fringe * varies).sum(where=whole, dtype=np.float64) / power, LEAST_CONTRAST, 1.0)
+    )
 
 
 def phase_slopes(residual_rad: Image, inside: Mask, smooth_px: float) -> tuple[Image, Image]:
-    """Change of the residual phase a px along x and y, float32 (H, W), averaged under a Gaussian inside the mask."""
+    """Change of the residual phase a px along x and y, float32 (H, W), averaged under a Gaussian
+    inside the mask."""
     size = 2 * int(np.ceil(2.5 * smooth_px)) + 1
     weight = cv2.erode(inside.astype(np.float32), np.ones((3, 3), np.uint8))
-    total = np.maximum(cv2.GaussianBlur(weight, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT), 1e-3)
+    total = np.maximum(
+        cv2.GaussianBlur(weight, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT), 1e-3
+    )
     slopes: list[Image] = []
     for axis in (1, 0):
-        change: NDArray = wrapped(np.roll(residual_rad, -1, axis) - np.roll(residual_rad, 1, axis)) / 2
-        change = np.clip(change, -STEEPEST_RAD_PER_PX, STEEPEST_RAD_PER_PX).astype(np.float32) * weight
+        change: NDArray = (
+            wrapped(np.roll(residual_rad, -1, axis) - np.roll(residual_rad, 1, axis)) / 2
+        )
+        change = (
+            np.clip(change, -STEEPEST_RAD_PER_PX, STEEPEST_RAD_PER_PX).astype(np.float32) * weight
+        )
         smooth = cv2.GaussianBlur(change, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT)
         slopes.append((smooth / total).astype(np.float32))
     return slopes[0], slopes[1]
 
 
-def fringes(carriers: Carriers, nearness: NDArray, contrast: tuple[float, float]) -> tuple[Image, Image]:
-    """Light over brightness (h, w) of crossed fringes of some ``contrast`` at ``nearness``, and its change by the joint
-    phase."""
+def fringes(
+    carriers: Carriers, nearness: NDArray, contrast: tuple[float, float]
+) -> tuple[Image, Image]:
+    """Light over brightness (h, w) of crossed fringes of some ``contrast`` at ``nearness``, and its
+    change by the joint phase."""
     raised, slope = np.ones(nearness.shape, np.float32), np.zeros(nearness.shape, np.float32)
     shares = carriers.gain / carriers.joint_gain
     for phase, share, modulation in zip(carriers.phases(nearness), shares, contrast, strict=True):
@@ -216,8 +258,8 @@ def fringes(carriers: Carriers, nearness: NDArray, contrast: tuple[float, float]
 
 @dataclass(frozen=True)
 class Demodulated:
-    """On every ``stride``-th pixel: ``amplitude`` complex64 (2, h', w'), modulation and wrapped phase of each carrier,
-    and ``mean_grey`` float32 (h', w')."""
+    """On every ``stride``-th pixel: ``amplitude`` complex64 (2, h', w'), modulation and wrapped
+    phase of each carrier, and ``mean_grey`` float32 (h', w')."""
 
     amplitude: NDArray[np.complex64]
     mean_grey: Image
@@ -234,7 +276,8 @@ class Demodulated:
 
 
 class Demodulator:
-    """The filters of a pair of carriers, for images of their size; ``stride``: px between two answers."""
+    """The filters of a pair of carriers, for images of their size; ``stride``: px between two
+    answers."""
 
     def __init__(self, carriers: Carriers, stride: int) -> None:
         camera = carriers.rig.camera
@@ -242,23 +285,36 @@ class Demodulator:
         self._sigma_px = DEMODULATION_PERIODS * carriers.period_px
         kernels = window_kernels(carriers.step_rad, self._sigma_px)
         self._reach = kernels[0].shape[0] // 2
-        # A length that the stride divides, so that every stride-th sample is a whole number of samples apart.
-        self._coarse = [fft.next_fast_len(-(-(length + 2 * self._reach) // stride)) for length in self.shape]
+        # A length that the stride divides, so that every stride-th sample is a whole number of
+        # samples apart.
+        self._coarse = [
+            fft.next_fast_len(-(-(length + 2 * self._reach) // stride)) for length in self.shape
+        ]
         lengths = [stride * n for n in self._coarse]
         self._filters = []
         for kernel, step in zip(kernels, (*carriers.step_rad, np.zeros(2)), strict=True):
-            # Bins of the carrier along rows and columns: the band around them is moved to zero frequency.
-            centre = [round(float(rad) * n / TAU) for rad, n in zip(step[::-1], lengths, strict=True)]
+            # Bins of the carrier along rows and columns: the band around them is moved to zero
+            # frequency.
+            centre = [
+                round(float(rad) * n / TAU) for rad, n in zip(step[::-1], lengths, strict=True)
+            ]
             padded = np.zeros(lengths, np.complex128)
             padded[: kernel.shape[0], : kernel.shape[1]] = kernel
             padded = np.roll(padded, (-self._reach, -self._reach), (0, 1))
-            bins = np.ix_(*(self._band(c, n, m) for c, n, m in zip(centre, lengths, self._coarse, strict=True)))
+            bins = np.ix_(
+                *(
+                    self._band(c, n, m)
+                    for c, n, m in zip(centre, lengths, self._coarse, strict=True)
+                )
+            )
             response = np.conj(fft.fft2(np.conj(padded)))[bins] / stride**2
             ramps = [
                 np.exp(1j * TAU * c * (np.arange(0, size, stride)) / n)
                 for c, n, size in zip(centre, lengths, self.shape, strict=True)
             ]
-            self._filters.append((bins, response.astype(np.complex64), np.outer(*ramps).astype(np.complex64)))
+            self._filters.append(
+                (bins, response.astype(np.complex64), np.outer(*ramps).astype(np.complex64))
+            )
         self._lengths = lengths
 
     @staticmethod
@@ -270,17 +326,24 @@ class Demodulator:
         return noise_grey / (self._sigma_px * float(np.sqrt(TAU)))
 
     def phases_at(self, seen: Demodulated, carriers: Carriers) -> Image:
-        """Wrapped phases float32 (2, h, w) of all pixels of ``carriers``, from those on the grid: the carrier itself
-        is taken out before interpolating, and what is left changes slowly."""
+        """Wrapped phases float32 (2, h, w) of all pixels of ``carriers``, from those on the grid:
+        the carrier itself is taken out before interpolating, and what is left changes slowly."""
         rows, columns = carriers.crop
         y, x = (np.arange(part.start, part.stop, dtype=np.float32) for part in (rows, columns))
         grid_y, grid_x = (self.stride * np.arange(n) for n in seen.mean_grey.shape)
         places = np.meshgrid(x / self.stride, y / self.stride)
         phases = []
         for amplitude, (across, down) in zip(seen.amplitude, carriers.step_rad, strict=True):
-            slow = amplitude * np.outer(np.exp(-1j * down * grid_y), np.exp(-1j * across * grid_x)).astype(np.complex64)
+            slow = amplitude * np.outer(
+                np.exp(-1j * down * grid_y), np.exp(-1j * across * grid_x)
+            ).astype(np.complex64)
             real, imaginary = (
-                cv2.remap(np.ascontiguousarray(part), *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                cv2.remap(
+                    np.ascontiguousarray(part),
+                    *places,
+                    cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_REPLICATE,
+                )
                 for part in (slow.real, slow.imag)
             )
             fast = (down * y)[:, None] + across * x
@@ -288,7 +351,8 @@ class Demodulator:
         return np.stack(phases).astype(np.float32)
 
     def __call__(self, grey: Image) -> Demodulated:
-        """Demodulate an image float32 (H, W); beyond its border it is continued by its mirror image."""
+        """Demodulate an image float32 (H, W); beyond its border it is continued by its mirror
+        image."""
         (height, width), reach = self.shape, self._reach
         after = [n - length - reach for n, length in zip(self._lengths, self.shape, strict=True)]
         padded = np.pad(grey, ((reach, after[0]), (reach, after[1])), mode="symmetric")
@@ -302,8 +366,9 @@ class Demodulator:
 
 
 def window_kernels(step_rad: NDArray[np.float64], sigma_px: float) -> list[NDArray[np.complex128]]:
-    """Weights (n, n) of the grey levels around a pixel that give z of both carriers and the mean: the least-squares
-    solution of this module's model under a Gaussian window of ``sigma_px``; ``step_rad`` (2, 2) as of `Carriers`."""
+    """Weights (n, n) of the grey levels around a pixel that give z of both carriers and the mean:
+    the least-squares solution of this module's model under a Gaussian window of ``sigma_px``;
+    ``step_rad`` (2, 2) as of `Carriers`."""
     half = int(np.ceil(WINDOW_SIGMAS * sigma_px))
     x, y = np.meshgrid(*[np.arange(-half, half + 1, dtype=np.float64)] * 2)
     window = np.exp(-0.5 * (x * x + y * y) / sigma_px**2).ravel()
@@ -320,42 +385,59 @@ def window_kernels(step_rad: NDArray[np.float64], sigma_px: float) -> list[NDArr
 
 
 def steadied(
-    phase_rad: Image, modulation: Image, carrier_rad: Image, noise_grey: float, inside: Mask, sigma_px: float
+    phase_rad: Image,
+    modulation: Image,
+    carrier_rad: Image,
+    noise_grey: float,
+    inside: Mask,
+    sigma_px: float,
 ) -> tuple[Image, Image, Image]:
-    """Phase and modulation (h, w) of shifted frames and the modulation's noise, ``noise_grey`` for a pixel alone. Where
-    noise hides its phase, they are those of an average over its neighbours ``inside``, from which the carrier, whose
-    phase is ``carrier_rad``, is taken out first."""
+    """Phase and modulation (h, w) of shifted frames and the modulation's noise, ``noise_grey`` for
+    a pixel alone. Where noise hides its phase, they are those of an average over its neighbours
+    ``inside``, from which the carrier, whose phase is ``carrier_rad``, is taken out first."""
     weight = inside.astype(np.float32)
     carrier, own = (np.exp(1j * rad).astype(np.complex64) for rad in (carrier_rad, phase_rad))
     slow = weight * modulation * own / carrier
     maps = (weight, weight * modulation * modulation, slow.real, slow.imag)
-    share, power, real, imaginary = (cv2.GaussianBlur(np.ascontiguousarray(one), (0, 0), sigma_px) for one in maps)
+    share, power, real, imaginary = (
+        cv2.GaussianBlur(np.ascontiguousarray(one), (0, 0), sigma_px) for one in maps
+    )
     share = np.maximum(share, np.float32(1e-6))
     weak = inside & (power < (WEAK_SIGMAS * noise_grey) ** 2 * share)
     average = (real + np.complex64(1j) * imaginary) / share
     phase = np.where(weak, np.angle(average * carrier), phase_rad).astype(np.float32)
-    # The mean of white noise under a Gaussian of sigma s has 1 / (2 s sqrt(pi)) of its standard deviation.
-    noise = np.where(weak, noise_grey / (2 * sigma_px * np.sqrt(np.pi)), noise_grey).astype(np.float32)
+    # The mean of white noise under a Gaussian of sigma s has 1 / (2 s sqrt(pi)) of its standard
+    # deviation.
+    noise = np.where(weak, noise_grey / (2 * sigma_px * np.sqrt(np.pi)), noise_grey).astype(
+        np.float32
+    )
     return phase, np.where(weak, np.abs(average), modulation).astype(np.float32), noise
 
 
 def phase_noise_grey(psi: Image, modulation: Image, inside: Mask) -> float:
-    """Noise of a frame in grey levels, from the second differences of the phase ``psi`` (h, w), rad, of three frames
-    along the rows of the object; surfaces are planes to them, except for few pixels."""
+    """Noise of a frame in grey levels, from the second differences of the phase ``psi`` (h, w),
+    rad, of three frames along the rows of the object; surfaces are planes to them, except for few
+    pixels."""
     middle = inside[:, 2:] & inside[:, :-2] & inside[:, 1:-1]
     if not middle.any():
         return FLOOR_NOISE_GREY
     second = (psi[:, 2:] - 2 * psi[:, 1:-1] + psi[:, :-2])[middle] * modulation[:, 1:-1][middle]
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(second))) / np.sqrt(6 * 2 / 3), FLOOR_NOISE_GREY)
+    return max(
+        MAD_TO_SIGMA * float(np.median(np.abs(second))) / np.sqrt(6 * 2 / 3), FLOOR_NOISE_GREY
+    )
 
 
 def same_plane_mean(psi: Image, sigma: Image, inside: Mask) -> tuple[Image, Image]:
-    """Mean of every pixel's phase ``psi`` (h, w), rad, of standard uncertainty ``sigma``, and of the pairs of pixels
-    opposite each other, up to `REACH_PX` away, that differ from it and from a plane through it by no more than noise;
-    and the mean's uncertainty. Opposite pixels have the mean of their plane at the pixel, so a slope adds nothing."""
+    """Mean of every pixel's phase ``psi`` (h, w), rad, of standard uncertainty ``sigma``, and of
+    the pairs of pixels opposite each other, up to `REACH_PX` away, that differ from it and from a
+    plane through it by no more than noise; and the mean's uncertainty. Opposite pixels have the
+    mean of their plane at the pixel, so a slope adds nothing."""
     reach, limit = REACH_PX, np.float32(SAME_PLANE_SIGMAS**2)
     height, width = psi.shape
-    maps = np.pad(np.stack([psi, sigma * sigma, inside]).astype(np.float32), ((0, 0), (reach, reach), (reach, reach)))
+    maps = np.pad(
+        np.stack([psi, sigma * sigma, inside]).astype(np.float32),
+        ((0, 0), (reach, reach), (reach, reach)),
+    )
 
     def beside(down: int, right: int) -> NDArray[np.float32]:
         return maps[:, reach + down : reach + down + height, reach + right : reach + right + width]
@@ -374,7 +456,8 @@ def same_plane_mean(psi: Image, sigma: Image, inside: Mask) -> tuple[Image, Imag
         alike &= (second - psi) ** 2 < limit * (second_variance + own)
         variance = first_variance + second_variance
         alike &= (first + second - 2 * psi) ** 2 < limit * (variance + 4 * own)
-        # The middle of a pair, each with half of its weight, has a quarter of the sum of both variances.
+        # The middle of a pair, each with half of its weight, has a quarter of the sum of both
+        # variances.
         weight = np.where(alike, 4 / np.maximum(variance, np.float32(1e-12)), np.float32(0))
         total += weight * (first + second) / 2
         weights += weight
@@ -389,13 +472,15 @@ def best_sides(
     noise_grey: float,
     period_px: float,
 ) -> tuple[Image, Image, NDArray[np.intp]]:
-    """The window of a pixel near a depth edge or a crease covers two surfaces, and its fit lies between them. The
-    windows of some of its neighbours, up to three quarters of a period away, cover one: each offers its plane, and the
-    offer wins that explains the grey levels around the pixel best.
+    """The window of a pixel near a depth edge or a crease covers two surfaces, and its fit lies
+    between them. The windows of some of its neighbours, up to three quarters of a period away,
+    cover one: each offers its plane, and the offer wins that explains the grey levels around the
+    pixel best.
 
-    ``fit_of``: what was fitted, a map that depth follows from and the brightness, (h, w); ``raised``: light over
-    brightness that follows from such a map; ``light``: grey levels less ambient light. Returns both maps, and rows and
-    columns (2, h, w) of the neighbours that they are from."""
+    ``fit_of``: what was fitted, a map that depth follows from and the brightness, (h, w);
+    ``raised``: light over brightness that follows from such a map; ``light``: grey levels less
+    ambient light. Returns both maps, and rows and columns (2, h, w) of the neighbours that they are
+    from."""
     if min(inside.shape) < 2:  # no object
         return *fit_of, np.indices(inside.shape)
     weight = inside.astype(np.float32)
@@ -413,15 +498,26 @@ def best_sides(
     ]
     share = np.maximum(cv2.GaussianBlur(weight, (0, 0), SIDE_WINDOW_PX), 1e-6)
     height, width = inside.shape
-    best, away = np.full((3, height, width), np.inf, np.float32), np.zeros((2, height, width), np.intp)
+    best, away = (
+        np.full((3, height, width), np.inf, np.float32),
+        np.zeros((2, height, width), np.intp),
+    )
     for down, right in offsets:
-        there = slice(reach + down, reach + down + height), slice(reach + right, reach + right + width)
+        there = (
+            slice(reach + down, reach + down + height),
+            slice(reach + right, reach + right + width),
+        )
         values, bright, known, by_y, by_x, bright_y, bright_x = padded[:, *there]
         offered = values - down * by_y - right * by_x
         bright = np.maximum(bright - down * bright_y - right * bright_x, 0)
-        cost = (light - bright * raised(offered)) ** 2 / (noise_grey**2 + (SIDE_SHARE * bright) ** 2)
+        cost = (light - bright * raised(offered)) ** 2 / (
+            noise_grey**2 + (SIDE_SHARE * bright) ** 2
+        )
         cost = np.where(known > 0, np.minimum(cost, SIDE_CAP), SIDE_CAP) * weight
-        mean = cv2.GaussianBlur(cost, (0, 0), SIDE_WINDOW_PX) / share + SIDE_COST * np.hypot(down, right) / period_px
+        mean = (
+            cv2.GaussianBlur(cost, (0, 0), SIDE_WINDOW_PX) / share
+            + SIDE_COST * np.hypot(down, right) / period_px
+        )
         won = inside & (known > 0) & (mean < best[0])
         best[:, won] = mean[won], offered[won], bright[won]
         away[0][won], away[1][won] = down, right

@@ -1,8 +1,10 @@
-"""The phase route as methods of ``fpp-bench predict``: with given frames, or with the fewest that a scene needs.
+"""The phase route as methods of ``fpp-bench predict``: with given frames, or with the fewest that a
+scene needs.
 
-The fewest are decided while capturing, without ground truth. Capture one fringe and measure: the measurement gives its
-expected error, from its phase and from its order. While that error is too large, capture the frames that reduce it
-(more fringes for the phase, the Gray code for the order) and measure again. No captured frame is wasted.
+The fewest are decided while capturing, without ground truth. Capture one fringe and measure: the
+measurement gives its expected error, from its phase and from its order. While that error is too
+large, capture the frames that reduce it (more fringes for the phase, the Gray code for the order)
+and measure again. No captured frame is wasted.
 """
 
 import math
@@ -35,34 +37,42 @@ if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.submission.description import Submission
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
-"""Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views
-(14 of each direction; measured again on version 1 of the benchmark: 0.06, 0.10 and 0.05, docs/results/frames.md).
-The margin of an order overestimates the probability that it is wrong; these factors correct that."""
+"""Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames,
+over training views (14 of each direction; measured again on version 1 of the benchmark: 0.06, 0.10
+and 0.05, docs/results/frames.md). The margin of an order overestimates the probability that it is
+wrong; these factors correct that."""
 
 
 LIT_BACKGROUND = Assumption(
-    "a lit background", "Assumes a lit background; not one albedo, so that little tells the fringe order."
+    "a lit background",
+    "Assumes a lit background; not one albedo, so that little tells the fringe order.",
 )
 ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
 KNOWN_RANGE = Assumption(
     "known range",
-    "Assumes that what is lit stands in the working range, in which the fringe has one period at most.",
+    "Assumes that what is lit stands in the working range, in which the fringe has one period at "
+    "most.",
 )
 RANGE_AND_WALL = Assumption(
     "known range and wall",
-    "Assumes that what is lit stands in the working range, or is the wall behind it, whose distance the rig states.",
+    "Assumes that what is lit stands in the working range, or is the wall behind it, whose "
+    "distance the rig states.",
 )
-MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
+MASK = (
+    "object mask: an image of the frames' size, above 0 on the object in every sample (default: "
+    "found in each image)"
+)
 
 
 @dataclass(frozen=True)
 class PhaseOptions(Settings):
-    """Options of `PhaseMethod`: those of `Settings`, an object ``mask`` (a file of `captures.read_mask`), and
-    ``error_mm``, which makes it `FewestFrames`."""
+    """Options of `PhaseMethod`: those of `Settings`, an object ``mask`` (a file of
+    `captures.read_mask`), and ``error_mm``, which makes it `FewestFrames`."""
 
     error_mm: float | None = option(
         None,
-        "instead of --frames: for each scene the fewest frames whose expected error is at most this, starting with a "
+        "instead of --frames: for each scene the fewest frames whose expected error is at most "
+        "this, starting with a "
         "single fringe; may need the Gray code",
         "MM",
     )
@@ -79,14 +89,15 @@ class CrossedOptions:
 
 
 class RouteMethod(Method, Generic[Measured]):
-    """A method that measures every map of a sample at once by its `route`, which it puts together when it is made."""
+    """A method that measures every map of a sample at once by its `route`, which it puts together
+    when it is made."""
 
     route: AnyRoute[Measured]
     mask: NDArray[np.bool_] | None = None
 
     def use_mask(self, mask: str | Path | None) -> dict[str, str]:
-        """Take the object mask of every sample from a file (`captures.read_mask`), if there is one; what it adds to the
-        settings."""
+        """Take the object mask of every sample from a file (`captures.read_mask`), if there is one;
+        what it adds to the settings."""
         if mask is None:
             return {}
         self.mask = read_mask(Path(mask), (self.rig.camera.height, self.rig.camera.width))
@@ -104,11 +115,13 @@ class RouteMethod(Method, Generic[Measured]):
         return images
 
     def measure(self, frames: Frames) -> Measured:
-        """All maps of a captured sequence (`Measurement`); frames that are not in `frames_used` may be None."""
+        """All maps of a captured sequence (`Measurement`); frames that are not in `frames_used` may
+        be None."""
         return self.route.measure(self.images(frames), self.mask)
 
     def answer(self, frames: Frames) -> Answer:
-        """Depth, 0 = background, or masked where ``min_confidence`` is above 0, and its standard uncertainty."""
+        """Depth, 0 = background, or masked where ``min_confidence`` is above 0, and its standard
+        uncertainty."""
         measurement = self.measure(frames)
         return Answer(measurement.depth_mm, measurement.sigma_mm)
 
@@ -118,9 +131,10 @@ class RouteMethod(Method, Generic[Measured]):
 
 
 class PhaseMethod(RouteMethod[FringeMeasurement]):
-    """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``: a file
-    (`captures.read_mask`) that says where the object is in every sample, instead of the route's own mask. Raises
-    `PredictionError` for an unknown option or an invalid value, `CaptureError` for a mask that can't be used."""
+    """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``:
+    a file (`captures.read_mask`) that says where the object is in every sample, instead of the
+    route's own mask. Raises `PredictionError` for an unknown option or an invalid value,
+    `CaptureError` for a mask that can't be used."""
 
     name = "phase"
     purpose = "one fringe or a few, nothing learned"
@@ -130,19 +144,32 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
     def for_rig(cls, rig: Rig, **options: Any) -> Method:
         """`FewestFrames` where ``error_mm`` is given."""
         options = fringe_options(cls.name, rig, options)
-        return cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
+        return (
+            cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
+        )
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         given = self.checked_options(options)
-        settings = Settings(**{entry.name: getattr(given, entry.name) for entry in fields(Settings)})
+        settings = Settings(
+            **{entry.name: getattr(given, entry.name) for entry in fields(Settings)}
+        )
         model = OneCarrier(rig, settings)
         self.rig, self.options, self.route = rig, settings, one_carrier(model)
         sinusoids = rig.sequence.sinusoids(settings.direction)
         self.frames_used = tuple(sinusoids[step] for step in model.steps)
         frames = len(self.frames_used)
-        count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
-        cues, other_pitch = " + ".join(["range", *terms_of(settings)]), pitch_setting(rig, settings.direction)
-        self.title = f"Phase route, {count}{pitch_words(other_pitch)}, order by {cues}, nothing learned"
+        count = (
+            f"one {settings.direction} fringe"
+            if frames == 1
+            else f"{frames} {settings.direction} fringes"
+        )
+        cues, other_pitch = (
+            " + ".join(["range", *terms_of(settings)]),
+            pitch_setting(rig, settings.direction),
+        )
+        self.title = (
+            f"Phase route, {count}{pitch_words(other_pitch)}, order by {cues}, nothing learned"
+        )
         self.settings = asdict(settings) | self.use_mask(given.mask) | other_pitch
 
     @classmethod
@@ -174,8 +201,8 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
 
 
 def pitch_setting(rig: Rig, direction: Direction) -> dict[str, float]:
-    """What the settings of a row say of the fringes' period, in projector px and against the working range: nothing
-    where it is the paper's."""
+    """What the settings of a row say of the fringes' period, in projector px and against the
+    working range: nothing where it is the paper's."""
     pitch = rig.pitch(direction)
     if pitch == PAPER_PITCH_PX:
         return {}
@@ -183,7 +210,8 @@ def pitch_setting(rig: Rig, direction: Direction) -> dict[str, float]:
 
 
 def fringe_assumption(settings: Mapping[str, Any]) -> Assumption:
-    """What tells the order of one fringe with a `pitch_setting`: the range alone, if it has one period at most."""
+    """What tells the order of one fringe with a `pitch_setting`: the range alone, if it has one
+    period at most."""
     return KNOWN_RANGE if settings.get("periods_in_range", math.inf) <= 1 else ONE_ALBEDO
 
 
@@ -193,15 +221,17 @@ def pitch_words(settings: Mapping[str, Any], before: str = " of ") -> str:
 
 
 def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
-    """The frames that make one crossed frame: the rig's first crossed one, or the first sinusoid of both directions,
-    whose mean is one. Raises `PredictionError` for a rig without either, in the words of the method ``name``."""
+    """The frames that make one crossed frame: the rig's first crossed one, or the first sinusoid of
+    both directions, whose mean is one. Raises `PredictionError` for a rig without either, in the
+    words of the method ``name``."""
     if crossed := rig.sequence.crossed_frames:
         return crossed[:1]
     if rig.fringe_directions == DIRECTIONS:
         return tuple(sorted(rig.sequence.sinusoids(direction)[0] for direction in DIRECTIONS))
     listed = " and ".join(rig.fringe_directions) or "no"
     raise PredictionError(
-        f"{name}: needs a crossed frame, or one fringe of each direction to make it from; this rig projects {listed} "
+        f"{name}: needs a crossed frame, or one fringe of each direction to make it from; this rig "
+        f"projects {listed} "
         "fringes. fpp-bench patterns --design proposes crossed fringes for a rig"
     )
 
@@ -218,26 +248,37 @@ def has_crossed_fringes(rig: Rig) -> bool:
 
 
 def shifted_carrier(rig: Rig, name: str) -> int:
-    """The carrier that the rig's first three crossed frames shift. Raises `PredictionError`, in the words of the method
-    ``name``, for a rig without such frames."""
+    """The carrier that the rig's first three crossed frames shift. Raises `PredictionError`, in the
+    words of the method ``name``, for a rig without such frames."""
     family = rig.crossed
-    shifts = np.zeros((0, 2)) if family is None else np.asarray(family.shifts_deg[:CROSSED_FRAMES], np.float64)
+    shifts = (
+        np.zeros((0, 2))
+        if family is None
+        else np.asarray(family.shifts_deg[:CROSSED_FRAMES], np.float64)
+    )
     if len(shifts) == CROSSED_FRAMES:
         different = [len(set(np.mod(column, 360))) for column in shifts.T]
         if sorted(different) == [1, CROSSED_FRAMES]:
             return different.index(CROSSED_FRAMES)
-    found = "none" if family is None else f"{len(family)} with shifts_deg {[list(pair) for pair in family.shifts_deg]}"
+    found = (
+        "none"
+        if family is None
+        else f"{len(family)} with shifts_deg {[list(pair) for pair in family.shifts_deg]}"
+    )
     raise PredictionError(
-        f"{name} --frames {CROSSED_FRAMES}: needs three crossed frames that shift one carrier and keep the other "
-        f"still; this rig has {found}. Build with --rig crossed, or give the rig such shifts_deg (docs/own_rig.md)"
+        f"{name} --frames {CROSSED_FRAMES}: needs three crossed frames that shift one carrier and "
+        f"keep the other "
+        f"still; this rig has {found}. Build with --rig crossed, or give the rig such shifts_deg "
+        f"(docs/own_rig.md)"
     )
 
 
 class CrossedMethod(RouteMethod[Measurement]):
-    """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
-    is one. With ``frames`` 3: from three that shift one carrier. ``mask``: a file
-    (`captures.read_mask`) that says where the object is in every sample. Raises `PredictionError` for a rig without
-    such frames and for an invalid option, `CaptureError` for a mask that can't be used."""
+    """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of
+    both directions, which is one. With ``frames`` 3: from three that shift one carrier. ``mask``: a
+    file (`captures.read_mask`) that says where the object is in every sample. Raises
+    `PredictionError` for a rig without such frames and for an invalid option, `CaptureError` for a
+    mask that can't be used."""
 
     name = "crossed"
     purpose = "one frame with two fringe directions, or three, nothing learned"
@@ -255,13 +296,18 @@ class CrossedMethod(RouteMethod[Measurement]):
         given = self.checked_options(options)
         self.rig, frames, moved = rig, given.frames, None
         if frames == CROSSED_FRAMES:
-            self.frames_used, moved = rig.sequence.crossed_frames[:CROSSED_FRAMES], shifted_carrier(rig, self.name)
+            self.frames_used, moved = (
+                rig.sequence.crossed_frames[:CROSSED_FRAMES],
+                shifted_carrier(rig, self.name),
+            )
             count = "three frames"
         elif frames == 1:
             self.frames_used = frames_of(rig, self.name)
             count = "one frame" if len(self.frames_used) == 1 else "one frame, the mean of two"
         else:
-            raise PredictionError(f"{self.name} --frames {frames}: expected 1 or {CROSSED_FRAMES} crossed frames")
+            raise PredictionError(
+                f"{self.name} --frames {frames}: expected 1 or {CROSSED_FRAMES} crossed frames"
+            )
         model = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), moved=moved)
         self.route = two_carriers(model)
         pitches = " and ".join(f"{pitch:g}" for pitch in model.family.pitches_px)
@@ -273,7 +319,11 @@ class CrossedMethod(RouteMethod[Measurement]):
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
         if not has_crossed_fringes(rig):
             return []
-        return [{}, {"frames": CROSSED_FRAMES}] if len(rig.sequence.crossed_frames) >= CROSSED_FRAMES else [{}]
+        return (
+            [{}, {"frames": CROSSED_FRAMES}]
+            if len(rig.sequence.crossed_frames) >= CROSSED_FRAMES
+            else [{}]
+        )
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:
@@ -285,16 +335,20 @@ class CrossedMethod(RouteMethod[Measurement]):
 
 
 def crossed_name(submission: "Submission", begins: str) -> str | None:
-    """A short name for a submission of crossed fringes whose name ``begins`` so; None for another."""
+    """A short name for a submission of crossed fringes whose name ``begins`` so; None for
+    another."""
     if not submission.name.startswith(begins):
         return None
-    frames = {1: "1 frame", 2: "mean of 2"}.get(len(submission.frames_used), f"{len(submission.frames_used)} frames")
+    frames = {1: "1 frame", 2: "mean of 2"}.get(
+        len(submission.frames_used), f"{len(submission.frames_used)} frames"
+    )
     return f"{printable(submission.settings.get('weights', 'Crossed'))}, {frames}"
 
 
 def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
-    """``options`` of a method called ``name`` that computes with the fringes of one direction, by default the rig's
-    only one. Raises `PredictionError` for fringes that it would take for others."""
+    """``options`` of a method called ``name`` that computes with the fringes of one direction, by
+    default the rig's only one. Raises `PredictionError` for fringes that it would take for
+    others."""
     ways = rig.fringe_directions
     if len(ways) == 1:
         options = {"direction": ways[0], **options}
@@ -304,26 +358,30 @@ def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, An
     shifts = code.fringes[code.finest].shifts_deg
     if code.origin_px != 0 or shifts[0] != 0:
         raise PredictionError(
-            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
-            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); decode all frames instead"
+            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the "
+            f"first {direction} "
+            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); decode all "
+            f"frames instead"
         )
     if options.get("error_mm") is not None and not code.is_plain:
         raise PredictionError(
-            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and this rig has "
+            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and "
+            f"this rig has "
             f"{code.title}; say how many frames instead"
         )
     return options
 
 
 def direction_of(submission: "Submission") -> str:
-    """The setting ``direction`` of a submission. Raises ValueError or KeyError for settings of no fringe route."""
+    """The setting ``direction`` of a submission. Raises ValueError or KeyError for settings of no
+    fringe route."""
     return DIRECTIONS[DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class Look:
-    """Expected error with ``frames`` frames captured, means over object pixels in mm: from the phase and from the
-    order; ``gray_code``: whether the Gray code is among the frames."""
+    """Expected error with ``frames`` frames captured, means over object pixels in mm: from the
+    phase and from the order; ``gray_code``: whether the Gray code is among the frames."""
 
     frames: int
     gray_code: bool
@@ -341,75 +399,108 @@ class Look:
             float(values[on_object].mean(dtype=np.float64))
             for values in (measurement.expected_error_mm, measurement.order_doubt_mm)
         )
-        by_phase_mm, by_order_mm = error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1]
+        by_phase_mm, by_order_mm = (
+            error_mm - order_mm,
+            order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1],
+        )
         return cls(count, False, by_phase_mm + by_order_mm, by_phase_mm, by_order_mm)
 
 
 def levels_of(steps: int) -> tuple[int, ...]:
-    """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more where ``steps`` is a
-    multiple of three, else 1 and then all."""
+    """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more
+    where ``steps`` is a multiple of three, else 1 and then all."""
     if steps % PIXELWISE:
         return (1, steps)
     levels = [1, 2, PIXELWISE]
     for fringes in (6, steps):
-        if fringes > levels[-1] and set(steps_of(steps, levels[-1])) <= set(steps_of(steps, fringes)):
+        if fringes > levels[-1] and set(steps_of(steps, levels[-1])) <= set(
+            steps_of(steps, fringes)
+        ):
             levels.append(fringes)
     return tuple(levels)
 
 
 class FewestFrames(Method):
-    """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene: 1, 2 and 3 fringes a
-    third of a period apart, then 6, then 18; the Gray code may be added from 3 on. Frames that were not captured are
-    never read. Further options are those of `PhaseMethod`, except ``frames``. Raises `PredictionError` for an error
-    that is no positive number of mm, and as `PhaseMethod`."""
+    """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene:
+    1, 2 and 3 fringes a third of a period apart, then 6, then 18; the Gray code may be added from 3
+    on. Frames that were not captured are never read. Further options are those of `PhaseMethod`,
+    except ``frames``. Raises `PredictionError` for an error that is no positive number of mm, and
+    as `PhaseMethod`."""
 
     reports = True
 
     def __init__(self, rig: Rig, error_mm: float, **options: Any) -> None:
         self.name = PhaseMethod.name
-        if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0 < error_mm < np.inf:
-            raise PredictionError(f"error_mm {error_mm!r}: expected the largest error to accept, in mm, above 0")
+        if (
+            isinstance(error_mm, bool)
+            or not isinstance(error_mm, int | float)
+            or not 0 < error_mm < np.inf
+        ):
+            raise PredictionError(
+                f"error_mm {error_mm!r}: expected the largest error to accept, in mm, above 0"
+            )
         if "frames" in options:
-            raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
+            raise PredictionError(
+                "--frames and --error-mm: give one of them; --error-mm chooses the frames itself"
+            )
         self.rig, self.error_mm = rig, float(error_mm)
-        self.methods = {n: PhaseMethod(rig, **options, frames=n) for n in levels_of(rig.sequence.steps)}
+        self.methods = {
+            n: PhaseMethod(rig, **options, frames=n) for n in levels_of(rig.sequence.steps)
+        }
         self.options = self.methods[1].options
         self.gray = tuple(rig.sequence.gray(self.options.direction))
         fringes = {index for method in self.methods.values() for index in method.frames_used}
-        self.frames_used = tuple(sorted(fringes | set(self.gray)))  # all that a scene may need; most need few of them
-        self.title = f"Phase route, fewest {self.options.direction} fringes for {error_mm:g} mm, nothing learned"
+        self.frames_used = tuple(
+            sorted(fringes | set(self.gray))
+        )  # all that a scene may need; most need few of them
+        self.title = (
+            f"Phase route, fewest {self.options.direction} fringes for {error_mm:g} mm, nothing "
+            f"learned"
+        )
         settings = self.methods[1].settings
-        self.settings = {"error_mm": self.error_mm} | {key: settings[key] for key in settings if key != "frames"}
+        self.settings = {"error_mm": self.error_mm} | {
+            key: settings[key] for key in settings if key != "frames"
+        }
 
     def answer(self, frames: Frames) -> Answer:
-        """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left. The
-        depth of the last look, and the sample's report: number of frames, their indices, and the expected error at each
-        look."""
+        """Measure and capture more frames until the expected error is at most ``error_mm`` or no
+        frame is left. The depth of the last look, and the sample's report: number of frames, their
+        indices, and the expected error at each look."""
         looks: list[Look] = []
         gray = False
         for count, method in self.methods.items():
             measurement = method.measure(frames)
-            depth_mm, used, look = measurement.depth_mm, method.frames_used, Look.of(measurement, count)
+            depth_mm, used, look = (
+                measurement.depth_mm,
+                method.frames_used,
+                Look.of(measurement, count),
+            )
             if not gray:
                 looks.append(look)
-                # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe
-                # is left.
+                # The Gray code helps the order only: it is captured once the phase is good enough,
+                # or when no fringe is left.
                 phase_done = look.by_phase_mm <= self.error_mm or count == max(self.methods)
                 gray = look.expected_error_mm > self.error_mm and count >= PIXELWISE and phase_done
             if gray:
-                depth_mm = decode_stack(frames, self.rig, direction=self.options.direction, steps=count).depth_mm
+                depth_mm = decode_stack(
+                    frames, self.rig, direction=self.options.direction, steps=count
+                ).depth_mm
                 used = tuple(sorted({*used, *self.gray}))
                 looks.append(Look(len(used), True, look.by_phase_mm, look.by_phase_mm, 0.0))
             if looks[-1].expected_error_mm <= self.error_mm:
                 break
         rows = [
-            {key: round(value, 4) if key.endswith("_mm") else value for key, value in asdict(look).items()}
+            {
+                key: round(value, 4) if key.endswith("_mm") else value
+                for key, value in asdict(look).items()
+            }
             for look in looks
         ]
         last = {name: rows[-1][name] for name in ("frames", "expected_error_mm")}
         return Answer(depth_mm, report=last | {"frames_used": list(used), "looks": rows})
 
     def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-        """Summary of a split's reports for the submission's settings: mean and largest number of frames a sample."""
+        """Summary of a split's reports for the submission's settings: mean and largest number of
+        frames a sample."""
         counts = [int(report["frames"]) for report in reports]
         return {"frames_mean": round(float(np.mean(counts)), 3), "frames_most": max(counts)}

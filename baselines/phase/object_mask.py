@@ -1,9 +1,11 @@
-"""The object mask: pixels whose grey level the empty scene does not explain; where none is known, modulated pixels.
+"""The object mask: pixels whose grey level the empty scene does not explain; where none is known,
+modulated pixels.
 
-Twice a period the object's fringe is as bright as the plane's would be, so a single pixel of one frame can't be
-assigned to either. Inside the object, morphological closing by a quarter of a period fills these stripes. At the
-silhouette, a pixel is assigned to the better of two predictions of its grey level: that of the empty scene, and that of
-the object's fringe, extrapolated from the local fit beside it. Of several frames every pixel is tested by itself.
+Twice a period the object's fringe is as bright as the plane's would be, so a single pixel of one
+frame can't be assigned to either. Inside the object, morphological closing by a quarter of a period
+fills these stripes. At the silhouette, a pixel is assigned to the better of two predictions of its
+grey level: that of the empty scene, and that of the object's fringe, extrapolated from the local
+fit beside it. Of several frames every pixel is tested by itself.
 """
 
 from collections.abc import Iterable
@@ -18,38 +20,49 @@ from fpp_ml_bench.coding.code import MIN_MODULATION
 
 CLOSING_PERIODS = 0.27
 ENCLOSED_PERIODS, ENCLOSED_WINDOW_PERIODS, ENCLOSED_EXCESS = 0.6, 0.2, 1.0
-"""Radius of the closing whose pixels join the object where the mean square of the plane's misfit, in a window of this
-sigma, exceeds that of noise by this multiple: seven standard deviations of such a mean at 15 px a period."""
-BORDER_PERIODS = 0.6  # width of the image's border, where blur mixes in what no pixel shows; no object is there alone
+"""Radius of the closing whose pixels join the object where the mean square of the plane's misfit,
+in a window of this sigma, exceeds that of noise by this multiple: seven standard deviations of such
+a mean at 15 px a period."""
+BORDER_PERIODS = 0.6
+"""Width of the image's border, where blur mixes in what no pixel shows; no object is there
+alone."""
 GAP_PX, GAP_PLANE, GAP_OBJECT = 0.8, 4.0, 16.0
-"""Sigma of the average in which a gap in the object is told, the largest mean square of the plane's misfit there over
-that of noise, and the least of the object's."""
+"""Sigma of the average in which a gap in the object is told, the largest mean square of the plane's
+misfit there over that of noise, and the least of the object's."""
 RING_PERIODS = 0.14
-"""Distance from the first mask's silhouette within which a pixel may change between object and background."""
+"""Distance from the first mask's silhouette within which a pixel may change between object and
+background."""
 LARGEST_MISFIT = 0.35  # of a fringe that is there, squared, as a share of its own square
-OBJECT_BONUS = 4.0  # added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object
+OBJECT_BONUS = 4.0
+"""Added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is
+object."""
 UNLIT_PERIODS = 0.8
 UNLIT_SIGMAS = 4.0  # brightest grey level, above ambient light, of what counts as unlit
 DARKEST_GREY = MIN_MODULATION / 4
-"""An object pixel with less modulation has no fringe: it lies in shadow or faces away, and gets no depth."""
-LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in squares of one period
+"""An object pixel with less modulation has no fringe: it lies in shadow or faces away, and gets no
+depth."""
+LEAST_AREA_PERIODS = 0.1
+"""Smallest object, and largest hole that is closed, in squares of one period."""
 PLANE_CHANCE_SIGMAS = 4.0
-"""How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the empty plane."""
+"""How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the
+empty plane."""
 PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
 SEAM_PX = 2  # half the width of a seam along a shadow, and of a rim
 UNLIT_PX = 3  # side of the square that is averaged to tell faint light
 SQUARE_PX = 5  # side of the square over which faint differences are averaged
 PIXELWISE_CLOSING_PERIODS = 0.2
 ALIKE = 0.2
-"""Largest relative difference from the brightness around of an object pixel that the empty scene explains as well."""
-SPECK_PX = 6  # smallest group of pixels that counts as object, and largest hole in it that is closed
+"""Largest relative difference from the brightness around of an object pixel that the empty scene
+explains as well."""
+SPECK_PX = 6
+"""Smallest group of pixels that counts as object, and largest hole in it that is closed."""
 DARK_SIGMAS = 4.0
 CONTINUED_PX, CONTINUED_RAD = 3, 0.2
 
 
 def crop_around(region: Mask, margin_px: int, step: int = 1) -> Crop:
-    """Rows and columns of ``region`` with ``margin_px`` around it, from a multiple of ``step`` on; a single pixel where
-    there is no object."""
+    """Rows and columns of ``region`` with ``margin_px`` around it, from a multiple of ``step`` on;
+    a single pixel where there is no object."""
     left, top, width, height = cv2.boundingRect(region.astype(np.uint8))
     if not width:
         return slice(0, 1), slice(0, 1)
@@ -68,22 +81,30 @@ def disk(radius_px: float) -> NDArray[np.uint8]:
 
 
 def closed(mask: Mask, radius_px: float, least_px: float) -> Mask:
-    """``mask`` closed by a disk, then without objects and without holes of fewer than ``least_px`` pixels."""
-    region = without_small(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, disk(radius_px)) > 0, least_px)
+    """``mask`` closed by a disk, then without objects and without holes of fewer than ``least_px``
+    pixels."""
+    region = without_small(
+        cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, disk(radius_px)) > 0, least_px
+    )
     return region | ~without_small(~region, least_px)
 
 
 def without_small(mask: Mask, least_px: float) -> Mask:
     """``mask`` (H, W) without its 8-connected components of fewer than ``least_px`` pixels."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        mask.astype(np.uint8), connectivity=8
+    )
     keep = stats[:, cv2.CC_STAT_AREA] >= least_px
     keep[0] = False
     return keep[labels] if count > 1 else mask
 
 
 def object_region(background: Background, period_px: float) -> Mask:
-    """First mask (H, W): pixels that differ, closed over the stripes where object and plane are equally bright."""
-    return closed(background.different, CLOSING_PERIODS * period_px, LEAST_AREA_PERIODS * period_px**2)
+    """First mask (H, W): pixels that differ, closed over the stripes where object and plane are
+    equally bright."""
+    return closed(
+        background.different, CLOSING_PERIODS * period_px, LEAST_AREA_PERIODS * period_px**2
+    )
 
 
 def beyond_border(region: Mask, period_px: float) -> Mask:
@@ -97,20 +118,28 @@ def beyond_border(region: Mask, period_px: float) -> Mask:
 
 
 def enclosed(region: Mask, background: Background, period_px: float) -> Mask:
-    """Pixels (H, W) within the closed ``region`` around which the empty scene does not explain the grey levels, though
-    it explains each one alone: dark parts of an object in a noisy frame."""
-    around = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, disk(ENCLOSED_PERIODS * period_px)) > 0
+    """Pixels (H, W) within the closed ``region`` around which the empty scene does not explain the
+    grey levels, though it explains each one alone: dark parts of an object in a noisy frame."""
+    around = (
+        cv2.morphologyEx(
+            region.astype(np.uint8), cv2.MORPH_CLOSE, disk(ENCLOSED_PERIODS * period_px)
+        )
+        > 0
+    )
     power = cv2.GaussianBlur(background.residual**2, (0, 0), ENCLOSED_WINDOW_PERIODS * period_px)
     return around & (power > (1 + ENCLOSED_EXCESS) * background.noise_grey**2)
 
 
 def gaps(inside: Mask, background: Background, misfit_grey: Image) -> tuple[Mask, Mask]:
-    """Pixels (h, w) of a closed mask ``inside`` that show the plane, through a hole or beside a rim: it explains them
-    and their nearest neighbours, and the object's fringe, which leaves ``misfit_grey``, does not. And those at its rim
-    that both explain. None on a plane of any albedo, which explains too much."""
+    """Pixels (h, w) of a closed mask ``inside`` that show the plane, through a hole or beside a
+    rim: it explains them and their nearest neighbours, and the object's fringe, which leaves
+    ``misfit_grey``, does not. And those at its rim that both explain. None on a plane of any
+    albedo, which explains too much."""
     if background.textured or not background.shown:
         return np.zeros_like(inside), np.zeros_like(inside)
-    as_plane, as_object = (cv2.GaussianBlur(misfit**2, (0, 0), GAP_PX) for misfit in (background.residual, misfit_grey))
+    as_plane, as_object = (
+        cv2.GaussianBlur(misfit**2, (0, 0), GAP_PX) for misfit in (background.residual, misfit_grey)
+    )
     noise = background.noise_grey**2
     plane = inside & ~background.different & (as_plane < GAP_PLANE * noise)
     found = plane & (as_object > GAP_OBJECT * noise)
@@ -118,10 +147,13 @@ def gaps(inside: Mask, background: Background, misfit_grey: Image) -> tuple[Mask
     return found, plane & rim & ~found
 
 
-def modulated_region(grey: Image, modulation: Image, background: Background, period_px: float) -> Mask:
-    """First mask (H, W) of an image that shows no known background: pixels with a fringe, by ``modulation`` in grey
-    levels (`local_fit.carrier_fit`), whose stripes are also as bright as such a fringe: the window of ``modulation``
-    reaches a third of a period beyond the silhouette, closing the stripes does not."""
+def modulated_region(
+    grey: Image, modulation: Image, background: Background, period_px: float
+) -> Mask:
+    """First mask (H, W) of an image that shows no known background: pixels with a fringe, by
+    ``modulation`` in grey levels (`local_fit.carrier_fit`), whose stripes are also as bright as
+    such a fringe: the window of ``modulation`` reaches a third of a period beyond the silhouette,
+    closing the stripes does not."""
     bright = stripes_filled(grey, period_px) > background.ambient_grey + 2 * MIN_MODULATION
     region = (modulation > MIN_MODULATION) & bright
     return closed(region, 1, LEAST_AREA_PERIODS * period_px**2)
@@ -135,18 +167,23 @@ def stripes_filled(grey: Image, period_px: float) -> Image:
 
 
 def unlit(grey: Image, background: Background, period_px: float, side_px: int = 1) -> Mask:
-    """Pixels (H, W) in ambient light alone over most of a period: closing fills the dark stripes of a fringe first.
-    Squares of ``side_px`` are averaged, so that a weaker light is told from noise."""
+    """Pixels (H, W) in ambient light alone over most of a period: closing fills the dark stripes of
+    a fringe first. Squares of ``side_px`` are averaged, so that a weaker light is told from
+    noise."""
     limit_grey = UNLIT_SIGMAS * background.noise_grey / side_px
     if side_px == 1:
         return stripes_filled(grey, period_px) < background.ambient_grey + limit_grey
     means: Image = cv2.blur(grey, (side_px, side_px))  # type: ignore[assignment]
-    return stripes_filled(means, period_px) < background.ambient_grey + limit_grey + PLANE_TOLERANCE_GREY
+    return (
+        stripes_filled(means, period_px)
+        < background.ambient_grey + limit_grey + PLANE_TOLERANCE_GREY
+    )
 
 
 def lit_part(inside: Mask, dark: Mask) -> Mask:
-    """Pixels (h, w) ``inside`` that are not ``dark``, and not a seam between these and the background either: along a
-    shadow's border the camera's blur mixes shadow and plane, which the empty scene does not explain."""
+    """Pixels (h, w) ``inside`` that are not ``dark``, and not a seam between these and the
+    background either: along a shadow's border the camera's blur mixes shadow and plane, which the
+    empty scene does not explain."""
     left = inside & ~dark
     core = cv2.morphologyEx(left.astype(np.uint8), cv2.MORPH_OPEN, disk(SEAM_PX)) > 0
     beside = cv2.dilate((inside & dark).astype(np.uint8), disk(2 * SEAM_PX)) > 0
@@ -154,8 +191,8 @@ def lit_part(inside: Mask, dark: Mask) -> Mask:
 
 
 def explained(grey: Image, predicted: Image, ambient_grey: float, period_px: float) -> Mask:
-    """Pixels (H, W) around which the ``predicted`` grey levels of the object's fringe are seen: not a dark hollow in it
-    into which only the fit's window reaches."""
+    """Pixels (H, W) around which the ``predicted`` grey levels of the object's fringe are seen: not
+    a dark hollow in it into which only the fit's window reaches."""
     sigma_px = RING_PERIODS * period_px
     light = predicted - np.float32(ambient_grey)
     misfit, power = (cv2.GaussianBlur(v * v, (0, 0), sigma_px) for v in (grey - predicted, light))
@@ -163,17 +200,24 @@ def explained(grey: Image, predicted: Image, ambient_grey: float, period_px: flo
 
 
 def refined(
-    region: Mask, background: Background, predicted: Image, grey: Image, fringe_noise: NDArray, reach_px: float
+    region: Mask,
+    background: Background,
+    predicted: Image,
+    grey: Image,
+    fringe_noise: NDArray,
+    reach_px: float,
 ) -> Mask:
-    """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette; ``predicted`` grey levels
-    of the object's fringe, NaN where nothing near predicts it; ``fringe_noise``: its noise, beside the image's."""
+    """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette;
+    ``predicted`` grey levels of the object's fringe, NaN where nothing near predicts it;
+    ``fringe_noise``: its noise, beside the image's."""
     noise = background.noise_grey
     as_plane = (background.residual / noise) ** 2
     with np.errstate(invalid="ignore"):
         as_object = (grey - predicted) ** 2 / (noise**2 + fringe_noise**2)
         nearer = as_object < as_plane + OBJECT_BONUS
     ring = cv2.dilate(region.astype(np.uint8), disk(reach_px)) > 0
-    # Pixels that differ stay. The others at the rim are object where the object's fringe explains them better.
+    # Pixels that differ stay. The others at the rim are object where the object's fringe explains
+    # them better.
     clear = background.different & region
     inner = cv2.erode(region.astype(np.uint8), disk(reach_px)) > 0
     votes = without_small(clear | inner | (ring & nearer), 4)
@@ -182,25 +226,30 @@ def refined(
 
 
 def differs(plane_misfits: Iterable[Image], noise_grey: float) -> Mask:
-    """Pixels (h, w) whose grey levels the empty scene does not explain, by ``plane_misfits`` (h, w) of each frame.
-    Tested for every pixel, and for means over a small square, which separate the plane from an object that happens to
-    be as bright; pixels that only the square's reach beyond the silhouette adds are removed."""
+    """Pixels (h, w) whose grey levels the empty scene does not explain, by ``plane_misfits`` (h, w)
+    of each frame. Tested for every pixel, and for means over a small square, which separate the
+    plane from an object that happens to be as bright; pixels that only the square's reach beyond
+    the silhouette adds are removed."""
     misfits, noise = list(plane_misfits), noise_grey**2
     alone = sum((misfit * misfit for misfit in misfits), np.float32(0))
-    around = np.asarray(sum((cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2 for misfit in misfits), np.float32(0)))
+    around = np.asarray(
+        sum((cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2 for misfit in misfits), np.float32(0))
+    )
     square_differs = (around > _limit(noise / SQUARE_PX**2, len(misfits))).astype(np.uint8)
     without_rim = cv2.erode(square_differs, np.ones((SQUARE_PX, SQUARE_PX), np.uint8)) > 0
     return (alone > _limit(noise, len(misfits))) | without_rim
 
 
 def _limit(variance: float, count: int) -> float:
-    """Squared misfit of ``count`` frames that the empty scene, with noise of that variance, hardly ever exceeds."""
+    """Squared misfit of ``count`` frames that the empty scene, with noise of that variance, hardly
+    ever exceeds."""
     chance = count + PLANE_CHANCE_SIGMAS * np.sqrt(2 * count) + PLANE_CHANCE_SIGMAS
     return float((variance + PLANE_TOLERANCE_GREY**2) * chance)
 
 
 def first_mask(different: Mask, period_px: float) -> Mask:
-    """Object pixels (h, w) before brightness is known: small stripes and holes closed, specks removed."""
+    """Object pixels (h, w) before brightness is known: small stripes and holes closed, specks
+    removed."""
     return closed(different, PIXELWISE_CLOSING_PERIODS * period_px, SPECK_PX)
 
 
@@ -212,12 +261,15 @@ def lit_object(
     shown: bool,
     period_px: float,
 ) -> Mask:
-    """Object pixels (h, w): those of ``region`` (`first_mask`) that are ``different`` (`differs`) and modulated by more
-    than the noise of their modulation; ``shown``: whether the background is. Pixels that only closing has added must be
-    as bright as the object around them, otherwise they are the plane beside a corner."""
+    """Object pixels (h, w): those of ``region`` (`first_mask`) that are ``different`` (`differs`)
+    and modulated by more than the noise of their modulation; ``shown``: whether the background is.
+    Pixels that only closing has added must be as bright as the object around them, otherwise they
+    are the plane beside a corner."""
     least_grey: Image | np.float32 = np.float32(MIN_MODULATION)
     if shown:  # otherwise nothing else tells the object
-        least_grey = np.minimum(np.maximum(np.float32(DARK_SIGMAS) * noise_grey, np.float32(DARKEST_GREY)), least_grey)
+        least_grey = np.minimum(
+            np.maximum(np.float32(DARK_SIGMAS) * noise_grey, np.float32(DARKEST_GREY)), least_grey
+        )
     certain = region & different & (modulation > least_grey)
     side = 2 * round(PIXELWISE_CLOSING_PERIODS * period_px) + 1
     weight = cv2.blur(certain.astype(np.float32), (side, side))
@@ -227,9 +279,10 @@ def lit_object(
 
 
 def continued(inside: Mask, region: Mask, different: Mask, residual_rad: Image) -> Mask:
-    """Object pixels (h, w), and those of ``region`` with `CONTINUED_PX` object pixels beside them that either have the
-    same ``residual_rad``, or are themselves ``different`` from the empty scene: where object and plane happen to have
-    the same grey levels in all frames, and where light from other surfaces drowns the fringe."""
+    """Object pixels (h, w), and those of ``region`` with `CONTINUED_PX` object pixels beside them
+    that either have the same ``residual_rad``, or are themselves ``different`` from the empty
+    scene: where object and plane happen to have the same grey levels in all frames, and where light
+    from other surfaces drowns the fringe."""
     beside, alike = np.zeros(inside.shape, np.uint8), np.zeros(inside.shape, np.uint8)
     padded, phases = np.pad(inside, 1), np.pad(residual_rad, 1)
     height, width = inside.shape

@@ -1,10 +1,12 @@
-"""First stop: what frames show before any order is chosen. Background, object mask, phase and brightness.
+"""First stop: what frames show before any order is chosen. Background, object mask, phase and
+brightness.
 
-A *measurement model* is one carrier or two, in one frame or a few. With three or more shifted frames the phase is the
-N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so that two surfaces are never mixed at a depth edge.
-One frame has more unknowns than grey levels, and a window of neighbours is fitted (`local_fit`). Two frames have one
-equation too few, but a projected fringe goes down to black: its mean is its modulation plus ambient light. With that
-constraint a window of a few px (`PAIR_WINDOW_PERIODS`) is enough. Three crossed frames shift one carrier and keep the
+A *measurement model* is one carrier or two, in one frame or a few. With three or more shifted
+frames the phase is the N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so that two
+surfaces are never mixed at a depth edge. One frame has more unknowns than grey levels, and a window
+of neighbours is fitted (`local_fit`). Two frames have one equation too few, but a projected fringe
+goes down to black: its mean is its modulation plus ambient light. With that constraint a window of
+a few px (`PAIR_WINDOW_PERIODS`) is enough. Three crossed frames shift one carrier and keep the
 other still, which is left in their mean, where the shifted one cancels.
 """
 
@@ -75,9 +77,11 @@ from fpp_ml_bench.optics.rig import Rig
 Frames = NDArray | Sequence[NDArray]
 EVERYWHERE = (slice(None), slice(None))
 CROSSED_FRAMES = 3  # that shift one carrier
-MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
+MARGIN_PERIODS = 0.5
+"""Of the crop around the object: covers the windows, and the mask may grow into it."""
 FIRST_WINDOW_PERIODS = 0.35
-"""Sigma of the window of the first fit, in periods. All windows were chosen on train and validation objects."""
+"""Sigma of the window of the first fit, in periods. All windows were chosen on train and validation
+objects."""
 SECOND_WINDOW_PERIODS = 0.27
 """Of the second fit, which starts from the phase of the first."""
 PAIR_WINDOW_PERIODS = 0.06
@@ -85,25 +89,30 @@ PAIR_WINDOW_PERIODS = 0.06
 SLOPE_PERIODS = 0.13
 """Of the Gaussian under which slopes of the phase are averaged."""
 SLACK_MM = 15.0
-"""By which the range is widened in which orders are chosen, for noise at its ends: a depth beyond them is left out, and
-no other order is taken to be within."""
-FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
-CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2  # fits that measure the contrast of the fringes, and that use it
+"""By which the range is widened in which orders are chosen, for noise at its ends: a depth beyond
+them is left out, and no other order is taken to be within."""
+FRINGE_NOISE = 0.03
+"""Uncertainty of a fringe extrapolated beyond its window, as a share of its brightness."""
+CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2
+"""Fits that measure the contrast of the fringes, and that use it."""
 PAIR_ROUNDS = 2  # fits to two frames over the small window
 MOST_SLACK_PERIODS = 0.07
-"""Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, where `SLACK_MM` is less, and
-4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every pixel have a second order."""
+"""Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, where
+`SLACK_MM` is less, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every
+pixel have a second order."""
 LEAST_CONTRAST = 0.08
-FAINT_SIGMAS = 6.0  # modulation of a window below which light shows no fringe: a shadow that other light reaches
+FAINT_SIGMAS = 6.0
+"""Modulation of a window below which light shows no fringe: a shadow that other light reaches."""
 CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Frames measured around the object: maps (h, w) of the part ``crop`` of images of ``shape`` (H, W). ``greys``:
-    float32 grey levels of each frame; ``background``: fit of the empty scene; ``inside``: object, ``given`` by the user
-    or found; ``period_px``: of the fringe in the image, the longer one of two; orders are chosen on a grid of every
-    ``stride``-th pixel, for depths of ``range_mm``. An image without an object has a crop of one pixel."""
+    """Frames measured around the object: maps (h, w) of the part ``crop`` of images of ``shape``
+    (H, W). ``greys``: float32 grey levels of each frame; ``background``: fit of the empty scene;
+    ``inside``: object, ``given`` by the user or found; ``period_px``: of the fringe in the image,
+    the longer one of two; orders are chosen on a grid of every ``stride``-th pixel, for depths of
+    ``range_mm``. An image without an object has a crop of one pixel."""
 
     rig: Rig
     period_px: float
@@ -127,10 +136,13 @@ class Capture:
         return np.any([grey >= GREY_LEVELS for grey in self.greys], axis=0) & self.inside
 
     def spread(self, values: NDArray) -> NDArray:
-        """Maps of the grid (..., h', w') at all pixels, each that of its grid point or of the nearest one inside."""
+        """Maps of the grid (..., h', w') at all pixels, each that of its grid point or of the
+        nearest one inside."""
         if self.pixelwise and self.stride == 1:
             return values
-        return repeated(values[..., *self._nearest], self.stride, (*values.shape[:-2], *self.inside.shape))
+        return repeated(
+            values[..., *self._nearest], self.stride, (*values.shape[:-2], *self.inside.shape)
+        )
 
     @cached_property
     def _nearest(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -139,10 +151,11 @@ class Capture:
 
 @dataclass(frozen=True)
 class Observation(Capture):
-    """Fringes of one direction, whose frames are shifted by ``shifts_rad``. ``layer``: calibration layer of the crop;
-    ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in [-pi, pi]; ``slopes``: change
-    of the residual phase in rad a px along x and y; ``mean_grey``: of pixelwise frames; ``uncertainty_rad`` float32: of
-    the phase, without the order, None for that of the fit (`depth`)."""
+    """Fringes of one direction, whose frames are shifted by ``shifts_rad``. ``layer``: calibration
+    layer of the crop; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's
+    phase in [-pi, pi]; ``slopes``: change of the residual phase in rad a px along x and y;
+    ``mean_grey``: of pixelwise frames; ``uncertainty_rad`` float32: of the phase, without the
+    order, None for that of the fit (`depth`)."""
 
     layer: CalibrationLayer
     shifts_rad: tuple[float, ...]
@@ -160,11 +173,12 @@ class Observation(Capture):
 
 @dataclass(frozen=True)
 class CrossedObservation(Capture):
-    """Fringes of two directions in ``grey``, the one frame or the mean of three that shift the carrier ``moved``.
-    ``phase_rad`` and ``modulation`` float32 (2, h, w): wrapped phases and grey levels, of windows, or of the pixel
-    itself for the carrier ``moved``; ``point_phase_rad`` (2, h', w'): the phases measured on the grid of orders;
-    ``contrast``: modulation over mean of each carrier, in this image; ``sigma_rad`` float32 (2, h, w): standard
-    uncertainty of the phases, of networks that measured them."""
+    """Fringes of two directions in ``grey``, the one frame or the mean of three that shift the
+    carrier ``moved``. ``phase_rad`` and ``modulation`` float32 (2, h, w): wrapped phases and grey
+    levels, of windows, or of the pixel itself for the carrier ``moved``; ``point_phase_rad`` (2,
+    h', w'): the phases measured on the grid of orders; ``contrast``: modulation over mean of each
+    carrier, in this image; ``sigma_rad`` float32 (2, h, w): standard uncertainty of the phases, of
+    networks that measured them."""
 
     carriers: Carriers
     moved: int | None
@@ -188,12 +202,18 @@ def modulation_noise_grey(shifts_rad: Sequence[float], noise_grey: float) -> flo
 
 
 class MeasurementModel:
-    """What a rig photographs, and how phase is measured in it. Images whose fringe period ``seen_px`` is beyond
-    ``periods`` are resampled: then ``rig`` is that of the resampled images, which an observation is of; images and
-    masks have the captured size. ``frames``: their number and what they are."""
+    """What a rig photographs, and how phase is measured in it. Images whose fringe period
+    ``seen_px`` is beyond ``periods`` are resampled: then ``rig`` is that of the resampled images,
+    which an observation is of; images and masks have the captured size. ``frames``: their number
+    and what they are."""
 
     def __init__(
-        self, rig: Rig, settings: Settings, seen_px: float, periods: Periods | None, frames: tuple[int, str]
+        self,
+        rig: Rig,
+        settings: Settings,
+        seen_px: float,
+        periods: Periods | None,
+        frames: tuple[int, str],
     ) -> None:
         self.settings, self.frames, self.slack_mm = settings, frames, SLACK_MM
         self.resampling = Resampling.of(rig, seen_px, periods or Periods())
@@ -206,8 +226,8 @@ class MeasurementModel:
         return near - self.slack_mm, far + self.slack_mm
 
     def images(self, given: Frames) -> list[NDArray]:
-        """Grey levels of captured frames, uint8 or float32 (H, W) each, in the size of ``rig``. Raises `DecodeError`
-        for another number, dtype or shape."""
+        """Grey levels of captured frames, uint8 or float32 (H, W) each, in the size of ``rig``.
+        Raises `DecodeError` for another number, dtype or shape."""
         frames = [given] if isinstance(given, np.ndarray) and given.ndim == 2 else list(given)
         count, kind = self.frames
         if len(frames) != count:
@@ -215,10 +235,15 @@ class MeasurementModel:
         camera = self.resampling.captured.camera
         images = [grey_levels(frame) for frame in frames]
         for image in images:
-            if image.dtype not in (np.uint8, np.float32) or image.shape != (camera.height, camera.width):
+            if image.dtype not in (np.uint8, np.float32) or image.shape != (
+                camera.height,
+                camera.width,
+            ):
                 raise DecodeError(
-                    f"expected frames of uint8 grey levels, shape (H, W) = {(camera.height, camera.width)} of the "
-                    f"rig's camera, got {image.dtype} {image.shape}; use rig.scaled(width) for a resized image"
+                    f"expected frames of uint8 grey levels, shape (H, W) = "
+                    f"{(camera.height, camera.width)} of the "
+                    f"rig's camera, got {image.dtype} {image.shape}; use rig.scaled(width) for a "
+                    f"resized image"
                 )
         return [self.resampling.image(image) for image in images]
 
@@ -226,22 +251,35 @@ class MeasurementModel:
 class OneCarrier(MeasurementModel):
     """Fringes of one direction, ``settings.frames`` of them (`steps_of`)."""
 
-    def __init__(self, rig: Rig, settings: Settings | None = None, periods: Periods | None = None) -> None:
+    def __init__(
+        self, rig: Rig, settings: Settings | None = None, periods: Periods | None = None
+    ) -> None:
         settings = settings or Settings()
         rig.check_sampling()
         shifts_rad = rig.shifts_rad(settings.direction)
         self.steps = steps_of(len(shifts_rad), settings.frames)
         self.shifts_rad = tuple(shifts_rad[step] for step in self.steps)
         frames = len(self.steps), f"fringes, those of steps {self.steps}"
-        super().__init__(rig, settings, rig.image_px_per_period(settings.direction), periods, frames)
+        super().__init__(
+            rig, settings, rig.image_px_per_period(settings.direction), periods, frames
+        )
         rig = self.rig
         self.layer = CalibrationLayer.of(rig, settings.direction)
-        (near, far), periods_in_range = rig.working_range_mm, rig.periods_in_range(settings.direction)
-        most_slack_mm = MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
+        (near, far), periods_in_range = (
+            rig.working_range_mm,
+            rig.periods_in_range(settings.direction),
+        )
+        most_slack_mm = (
+            MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
+        )
         self.slack_mm = min(SLACK_MM, most_slack_mm)
         self.period_px = rig.image_px_per_period(settings.direction)
-        self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
-        self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
+        self._scene = EmptyScene(
+            rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey
+        )
+        self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(
+            np.float32
+        )
         sigmas = [FIRST_WINDOW_PERIODS, SECOND_WINDOW_PERIODS]
         if settings.frames == 2:
             sigmas += [PAIR_WINDOW_PERIODS] * PAIR_ROUNDS
@@ -253,8 +291,9 @@ class OneCarrier(MeasurementModel):
         return CalibrationLayer.of(self.resampling.captured, self.settings.direction)
 
     def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
-        """Mask and phase of captured fringes: one, uint8 (H, W), or the frames of ``steps``. ``mask`` bool (H, W)
-        replaces the object mask that is found. Raises `DecodeError` for another number, dtype or shape."""
+        """Mask and phase of captured fringes: one, uint8 (H, W), or the frames of ``steps``.
+        ``mask`` bool (H, W) replaces the object mask that is found. Raises `DecodeError` for
+        another number, dtype or shape."""
         images = self.images(image)
         background = self._scene.fit(images[0])
         if mask is not None:
@@ -263,7 +302,9 @@ class OneCarrier(MeasurementModel):
             region = object_region(background, self.period_px)
         else:
             first = images[0].astype(np.float32)
-            _, modulation = carrier_fit(first, np.ones(first.shape, bool), self._carrier, self.windows[0])
+            _, modulation = carrier_fit(
+                first, np.ones(first.shape, bool), self._carrier, self.windows[0]
+            )
             region = modulated_region(first, modulation, background, self.period_px)
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * self.period_px)))
         greys = tuple(frame[crop].astype(np.float32) for frame in images)
@@ -280,7 +321,9 @@ class OneCarrier(MeasurementModel):
             phase, modulation, mean_grey = (np.asarray(values, np.float32) for values in fitted)
             if mask is None:
                 noise = modulation_noise_grey(self.shifts_rad, background.noise_grey)
-                inside = lit_object(different, region, modulation, noise, background.shown, self.period_px)
+                inside = lit_object(
+                    different, region, modulation, noise, background.shown, self.period_px
+                )
             # The share of a window on the object is what the use of slopes needs.
             fit = FringeFit(phase, modulation, self.windows[1].moment(inside.astype(np.float32)))
         else:
@@ -310,8 +353,8 @@ class OneCarrier(MeasurementModel):
     def _local_fits(
         self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool
     ) -> tuple[Mask, FringeFit]:
-        """Object mask and local fits of one or two frames, each window starting from the phase of the last; ``region``:
-        where frames differ from the empty scene, or the ``given`` mask."""
+        """Object mask and local fits of one or two frames, each window starting from the phase of
+        the last; ``region``: where frames differ from the empty scene, or the ``given`` mask."""
         period_px, inside, grey = self.period_px, region, greys[0]
         if not given:
             dark = unlit(np.maximum.reduce(greys), background, period_px)
@@ -322,12 +365,14 @@ class OneCarrier(MeasurementModel):
             fit = fringe_fit(greys, inside, phase, background.ambient_grey, window, self.shifts_rad)
             phase = fit.phase_rad
         if not background.calibrated:
-            # Fringes of any contrast on surfaces of any brightness: the contrast is measured, then the fits start
-            # again, because a fit keeps the ripple of the phase that it starts from.
+            # Fringes of any contrast on surfaces of any brightness: the contrast is measured, then
+            # the fits start again, because a fit keeps the ripple of the phase that it starts from.
             ambient = background.ambient_grey
             for _ in range(CONTRAST_ROUNDS):
                 if not given:
-                    inside = inside & explained(grey, np.float32(ambient) + fit.light, ambient, period_px)
+                    inside = inside & explained(
+                        grey, np.float32(ambient) + fit.light, ambient, period_px
+                    )
                 contrast = measured_contrast(grey - np.float32(ambient), inside, fit)
                 light = ambient, self.windows[0], self.shifts_rad, contrast, CURVED
                 fit = fringe_fit(greys, inside, fit.phase_rad, *light)
@@ -340,14 +385,21 @@ class OneCarrier(MeasurementModel):
         if len(greys) == 1:
             bright = np.maximum(fit.brightness, 0)
             predicted = (background.ambient_grey + fit.light).astype(np.float32)
-            inside = refined(inside, background, predicted, grey, FRINGE_NOISE * bright, RING_PERIODS * period_px)
-        inside = inside & ~dark & (fit.brightness > (DARKEST_GREY if background.shown else MIN_MODULATION))
+            inside = refined(
+                inside, background, predicted, grey, FRINGE_NOISE * bright, RING_PERIODS * period_px
+            )
+        inside = (
+            inside
+            & ~dark
+            & (fit.brightness > (DARKEST_GREY if background.shown else MIN_MODULATION))
+        )
         return inside, fit
 
 
 class TwoCarriers(MeasurementModel):
-    """Crossed fringes of a ``family`` (default: the rig's own), one frame; or three frames of the rig, of which the
-    carrier ``moved`` is shifted. Raises `PredictionError` where carriers hardly change with depth."""
+    """Crossed fringes of a ``family`` (default: the rig's own), one frame; or three frames of the
+    rig, of which the carrier ``moved`` is shifted. Raises `PredictionError` where carriers hardly
+    change with depth."""
 
     def __init__(
         self,
@@ -374,11 +426,14 @@ class TwoCarriers(MeasurementModel):
         self.shifts_rad = [float(np.radians(pair[moved])) for pair in shifted]
         standoff = self.carriers.nearness(self.rig.standoff_m * MM_PER_M)
         self._standoff_rad = self.carriers.phases(standoff)[moved].astype(np.float32)
-        near_q, far_q = (float(np.median(self.carriers.nearness(end))) for end in self.rig.working_range_mm)
+        near_q, far_q = (
+            float(np.median(self.carriers.nearness(end))) for end in self.rig.working_range_mm
+        )
         span = float(np.median(np.abs(self.carriers.gain[moved]))) * abs(near_q - far_q)
         if not span >= LEAST_RANGE_RAD:
             raise PredictionError(
-                f"crossed --frames {CROSSED_FRAMES}: over the working range the carrier that the frames shift changes "
+                f"crossed --frames {CROSSED_FRAMES}: over the working range the carrier that the "
+                f"frames shift changes "
                 f"by {span:.2g} rad, too little for a depth; shift the other carrier"
             )
         for pair in shifted[1:]:
@@ -391,9 +446,9 @@ class TwoCarriers(MeasurementModel):
         return Carriers.of(self.resampling.captured, self.family)
 
     def observe(self, image: Frames, mask: Mask | None = None) -> CrossedObservation:
-        """Mask and both phases of one crossed frame, uint8 (H, W) or float32 grey levels of the same range, or of
-        three. ``mask`` bool (H, W) replaces the object mask that is found. Raises `DecodeError` for another number,
-        dtype or shape."""
+        """Mask and both phases of one crossed frame, uint8 (H, W) or float32 grey levels of the
+        same range, or of three. ``mask`` bool (H, W) replaces the object mask that is found. Raises
+        `DecodeError` for another number, dtype or shape."""
         greys, moved = [grey.astype(np.float32) for grey in self.images(image)], self.moved
         grey, period_px, stride = greys[0], self.period_px, self.stride
         if moved is not None:
@@ -403,13 +458,20 @@ class TwoCarriers(MeasurementModel):
             own_phase = wrapped(own_phase + np.float32(self.shifts_rad[0]))
         seen = self.demodulator(grey)
         pairs = zip(self._scenes, greys, strict=True)
-        planes = [scene(frame, seen if frame is grey else self.demodulator(frame)) for scene, frame in pairs]
+        planes = [
+            scene(frame, seen if frame is grey else self.demodulator(frame))
+            for scene, frame in pairs
+        ]
         background = planes[0]
         if mask is not None:
             region = self.resampling.mask(mask)
         elif not all(plane.shown for plane in planes):
             background = replace(background, share=0.0)
-            modulation = repeated(seen.modulation.max(axis=0), stride, grey.shape) if moved is None else own_modulation
+            modulation = (
+                repeated(seen.modulation.max(axis=0), stride, grey.shape)
+                if moved is None
+                else own_modulation
+            )
             region = modulated_region(grey, modulation, background, period_px)
         elif moved is None:
             region = object_region(background, period_px)
@@ -417,7 +479,9 @@ class TwoCarriers(MeasurementModel):
         else:
             different = differs([plane.residual for plane in planes], background.noise_grey)
             closed = first_mask(different, period_px)
-            lit_grey, lit_noise = self._steadied(own_phase, own_modulation, background, WEAK_LIGHT_PX)[1:]
+            lit_grey, lit_noise = self._steadied(
+                own_phase, own_modulation, background, WEAK_LIGHT_PX
+            )[1:]
             region = lit_object(different, closed, lit_grey, lit_noise, background.shown, period_px)
             residual = wrapped(own_phase - self.carriers.infinity_rad[moved])
             region = continued(region, closed, different, residual)
@@ -427,17 +491,24 @@ class TwoCarriers(MeasurementModel):
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
         grid = tuple(slice(part.start // stride, -(-part.stop // stride)) for part in crop)
         if mask is None and moved is None:
-            faint = seen.modulation[:, *grid].max(axis=0) < FAINT_SIGMAS * self.demodulator.noise(background.noise_grey)
+            faint = seen.modulation[:, *grid].max(axis=0) < FAINT_SIGMAS * self.demodulator.noise(
+                background.noise_grey
+            )
             dark = unlit(grey[crop], background, period_px, UNLIT_PX)
             inside = lit_part(inside, dark | repeated(faint, stride, inside.shape))
         carriers = self.carriers.at(crop)
-        points, mean_grey = inside[::stride, ::stride], seen.mean_grey[grid] - background.ambient_grey
+        points, mean_grey = (
+            inside[::stride, ::stride],
+            seen.mean_grey[grid] - background.ambient_grey,
+        )
         phases, modulation = self.demodulator.phases_at(seen, carriers), seen.modulation[:, *grid]
         if moved is None:
             whole = repeated(modulation[..., *nearest_inside(points)], stride, (2, *inside.shape))
         else:
             own = own_phase[crop], own_modulation[crop]
-            phases[moved], own_grey, _ = self._steadied(*own, background, WEAK_PHASE_PX, inside, crop)
+            phases[moved], own_grey, _ = self._steadied(
+                *own, background, WEAK_PHASE_PX, inside, crop
+            )
             modulation[moved] = own_grey[::stride, ::stride]
             whole = repeated(modulation, stride, (2, *inside.shape))
             whole[moved] = own_grey
@@ -473,16 +544,22 @@ class TwoCarriers(MeasurementModel):
         """`steadied` phase and modulation of the shifted carrier."""
         noise_grey = modulation_noise_grey(self.shifts_rad, background.noise_grey)
         whole = np.ones(phase_rad.shape, bool) if inside is None else inside
-        return steadied(phase_rad, modulation, self._standoff_rad[crop], noise_grey, whole, sigma_px)
+        return steadied(
+            phase_rad, modulation, self._standoff_rad[crop], noise_grey, whole, sigma_px
+        )
 
     def _contrast(self, modulation: Image, mean_grey: Image, points: Mask) -> tuple[float, float]:
-        """Modulation over mean of both carriers on the object; as projected where too little of it is seen."""
+        """Modulation over mean of both carriers on the object; as projected where too little of it
+        is seen."""
         reach = 2 * max(1, round(CONTRAST_RIM_PERIODS * self.period_px / self.stride)) + 1
         inner = cv2.erode(points.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0  # type: ignore[call-overload]
         inner &= mean_grey > MIN_MODULATION
         if not inner.any():
             return self.carriers.family.weights
         shares = np.median(modulation[:, inner] / mean_grey[inner], axis=1)
-        least, most = np.float32(LEAST_CONTRAST), np.asarray(self.carriers.family.weights, np.float32)
+        least, most = (
+            np.float32(LEAST_CONTRAST),
+            np.asarray(self.carriers.family.weights, np.float32),
+        )
         first, second = np.clip(shares, least, most).tolist()
         return first, second

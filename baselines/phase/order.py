@@ -1,10 +1,12 @@
-"""Third stop: the order of each pixel, by costs of its candidates and by least energy over neighbours.
+"""Third stop: the order of each pixel, by costs of its candidates and by least energy over
+neighbours.
 
-What tells an order are the `TERMS`, each a cost without unit for every candidate, and an assumption. A single point is
-often wrong; there the energy (`labels.least_energy`) lets its neighbours decide. Where nothing calibrates brightness,
-the order follows from range and continuity (`margin_by_range`): over a smooth surface all pixels share one error of the
-order, so that an order is settled if every other order would put a part of the surface outside the range. If another
-order keeps the whole surface inside, the two can't be distinguished, and the order is ambiguous.
+What tells an order are the `TERMS`, each a cost without unit for every candidate, and an
+assumption. A single point is often wrong; there the energy (`labels.least_energy`) lets its
+neighbours decide. Where nothing calibrates brightness, the order follows from range and continuity
+(`margin_by_range`): over a smooth surface all pixels share one error of the order, so that an order
+is settled if every other order would put a part of the surface outside the range. If another order
+keeps the whole surface inside, the two can't be distinguished, and the order is ambiguous.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,16 +34,19 @@ from fpp_ml_bench.errors import DecodeError
 
 LARGE = np.float32(1e4)  # cost of a candidate that does not exist
 EVIDENCE_PERIODS = 2.0
-"""Side of the square over which evidence for an order is averaged: a single pixel's brightness is too uncertain."""
+"""Side of the square over which evidence for an order is averaged: a single pixel's brightness is
+too uncertain."""
 LEAST_BRIGHTNESS = 1e-3  # least irradiance whose logarithm is taken, 1/m^2: a surface turned away
 PHASE_SIGMA_RAD = 0.35  # of a carrier's phase in a window, edges and texture included
 MOST_AGREEMENT = 2.83**2 / 2
 """Largest cost of a phase misfit: beyond it a window across an edge may show anything."""
 JUMP_RAD = 2.5
-"""Jump of the residual or joint phase between neighbours from which on it costs no more: a depth edge costs this,
-whatever its height. Chosen, as the costs below, on train and validation objects."""
+"""Jump of the residual or joint phase between neighbours from which on it costs no more: a depth
+edge costs this, whatever its height. Chosen, as the costs below, on train and validation
+objects."""
 SHADING_COST = 0.003
-"""Cost of a pixel, in rad of a jump, for each `SHADING_SPREAD` by which a candidate's log brightness is off."""
+"""Cost of a pixel, in rad of a jump, for each `SHADING_SPREAD` by which a candidate's log
+brightness is off."""
 SHADING_SPREAD = 0.1
 """Unit of that misfit."""
 SHADING_LIMIT = 3.0
@@ -49,47 +54,54 @@ SHADING_LIMIT = 3.0
 PRIOR_COST = 0.002
 """Cost of a pixel for each 100 mm from the standoff."""
 SMOOTHNESS = 33.0
-"""Weight of the link between two pixels: a pixel's window shares most of its light with its neighbour's, and one
-pixel's light may be that of two surfaces."""
+"""Weight of the link between two pixels: a pixel's window shares most of its light with its
+neighbour's, and one pixel's light may be that of two surfaces."""
 LIGHT_SIGMA, LIGHT_NOISE, MOST_LIGHT = 0.06, 1.2, 6.5
-"""Of a pixel's light over its brightness: standard uncertainty of the model, what noise over brightness adds, and the
-largest cost."""
+"""Of a pixel's light over its brightness: standard uncertainty of the model, what noise over
+brightness adds, and the largest cost."""
 INDIRECT_PERIODS, MOST_INDIRECT = 1.0, 0.4
-"""Light from other surfaces changes slowly: the window of its median, and its largest share of the brightness."""
+"""Light from other surfaces changes slowly: the window of its median, and its largest share of the
+brightness."""
 MEDIAN_STEP = 0.005
 LEAST_BRIGHT = 1.0  # grey levels
-EVIDENCE_WEIGHT = 2.0  # one carrier's phase has no error: evidence tells twice as much of the order as in one frame
+EVIDENCE_WEIGHT = 2.0
+"""One carrier's phase has no error: evidence tells twice as much of the order as in one frame."""
 STEEPEST_PERIODS = 1.2
-"""Largest change of the residual phase along a period of the image, in periods, within a smooth surface: a window that
-covers both sides of a depth edge turns the jump into a slope, mostly a larger one."""
+"""Largest change of the residual phase along a period of the image, in periods, within a smooth
+surface: a window that covers both sides of a depth edge turns the jump into a slope, mostly a
+larger one."""
 LARGEST_MISFIT, MISFIT_PERIODS = 0.4, 0.06
-"""Largest misfit of the fringe over its brightness within a surface, and the Gaussian, in periods, under which it is
-averaged: a depth edge is a line along which the window's fringe is not seen, whatever the phases of both sides."""
+"""Largest misfit of the fringe over its brightness within a surface, and the Gaussian, in periods,
+under which it is averaged: a depth edge is a line along which the window's fringe is not seen,
+whatever the phases of both sides."""
 NECK_PERIODS = 0.25
-"""Half the width of the narrowest connection between parts of a surface. Along a depth edge the jump is a whole number
-of periods here and there, and looks continuous; such places are short."""
+"""Half the width of the narrowest connection between parts of a surface. Along a depth edge the
+jump is a whole number of periods here and there, and looks continuous; such places are short."""
 LEAST_AREA_PERIODS = 0.5  # smallest surface, in squares of one period
 OUT_SHARE, OUT_AREA_PERIODS = 0.05, 0.1
-"""Share of a surface, and its area in squares of one period, that must leave the range for an order to be ruled out."""
+"""Share of a surface, and its area in squares of one period, that must leave the range for an order
+to be ruled out."""
 REACH_PERIODS = 0.35
 CONTINUES_RAD = 0.8
-"""Distance from a settled surface, and difference of the residual phase, within which a pixel continues it."""
+"""Distance from a settled surface, and difference of the residual phase, within which a pixel
+continues it."""
 SURE, LIKELY = 1.0, 0.03
-"""Margins of an order that is settled, and of one that may well be wrong, so that its stated uncertainty is a good part
-of an order: at the edge of a surface the phase may be that of two."""
+"""Margins of an order that is settled, and of one that may well be wrong, so that its stated
+uncertainty is a good part of an order: at the edge of a surface the phase may be that of two."""
 
 
 class Term(NamedTuple):
-    """Evidence for the order: what it ``assumes`` of a scene, and the cost (K, h, w) float32 of every candidate of an
-    observation, by the settings."""
+    """Evidence for the order: what it ``assumes`` of a scene, and the cost (K, h, w) float32 of
+    every candidate of an observation, by the settings."""
 
     assumes: str
     cost: Callable[[Any, Any, Settings], Image]
 
 
 def brightness_cost(seen: Observation, offered: FringeCandidates, settings: Settings) -> Image:
-    """The phase fixes how fast 1/Z changes along the surface, the order fixes Z itself: together they give distance and
-    normal of every candidate, and so the brightness of a matte surface there."""
+    """The phase fixes how fast 1/Z changes along the surface, the order fixes Z itself: together
+    they give distance and normal of every candidate, and so the brightness of a matte surface
+    there."""
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = np.maximum(offered.irradiance, LEAST_BRIGHTNESS)
         ratio = np.maximum(offered.brightness, LEAST_BRIGHTNESS) / expected
@@ -104,40 +116,56 @@ def standoff_cost(seen: Observation, offered: FringeCandidates, settings: Settin
     return np.float32(PRIOR_COST) * np.minimum(np.nan_to_num(offset, nan=10.0), 10)
 
 
-def agreement_cost(seen: CrossedObservation, offered: CrossedCandidates, settings: Settings) -> Image:
+def agreement_cost(
+    seen: CrossedObservation, offered: CrossedCandidates, settings: Settings
+) -> Image:
     """By the distance of both phases from the candidate's: s standard deviations cost s^2 / 2."""
     misfit = (offered.misfit_rad / np.float32(PHASE_SIGMA_RAD)) ** 2 / 2
     return np.minimum(misfit, np.float32(MOST_AGREEMENT))
 
 
-def pixel_light_cost(seen: CrossedObservation, offered: CrossedCandidates, settings: Settings) -> Image:
-    """By the deviation of the still carrier's measured cosine from that at the candidate's depth, s standard deviations
-    for s^2 / 2. The measured one follows from a pixel's mean grey level and its brightness, which the modulation of the
-    other carrier gives. Light from other surfaces is the local median of what the candidates of least misfit leave."""
+def pixel_light_cost(
+    seen: CrossedObservation, offered: CrossedCandidates, settings: Settings
+) -> Image:
+    """By the deviation of the still carrier's measured cosine from that at the candidate's depth, s
+    standard deviations for s^2 / 2. The measured one follows from a pixel's mean grey level and its
+    brightness, which the modulation of the other carrier gives. Light from other surfaces is the
+    local median of what the candidates of least misfit leave."""
     carriers, moved = seen.carriers, int(seen.moved or 0)
     still = 1 - moved
-    bright = np.maximum(seen.modulation[moved] / np.float32(seen.contrast[moved]), np.float32(LEAST_BRIGHT))
+    bright = np.maximum(
+        seen.modulation[moved] / np.float32(seen.contrast[moved]), np.float32(LEAST_BRIGHT)
+    )
     expected = np.cos(carriers.infinity_rad[still] + carriers.gain[still] * offered.nearness)
     left = seen.light / bright - 1 - np.float32(seen.contrast[still]) * expected
     likely = np.where(offered.exists, offered.misfit_rad, LARGE).argmin(axis=0)
-    indirect = local_median(chosen_values(left, likely), seen.inside, INDIRECT_PERIODS * seen.period_px)
+    indirect = local_median(
+        chosen_values(left, likely), seen.inside, INDIRECT_PERIODS * seen.period_px
+    )
     left -= np.minimum(indirect, np.float32(MOST_INDIRECT))
-    sigma = np.hypot(np.float32(LIGHT_SIGMA), np.float32(LIGHT_NOISE * seen.background.noise_grey) / bright)
+    sigma = np.hypot(
+        np.float32(LIGHT_SIGMA), np.float32(LIGHT_NOISE * seen.background.noise_grey) / bright
+    )
     return np.minimum((left / sigma) ** 2 / 2, np.float32(MOST_LIGHT)).astype(np.float32)
 
 
 TERMS = {
     "shading": Term(
-        "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness "
+        "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp "
+        "is: the brightness "
         "of the fringe image decides the fringe order.",
         brightness_cost,
     ),
-    "standoff": Term("Assumes objects near the rig's standoff, true of fixed placement.", standoff_cost),
-    "agreement": Term("Assumes that no texture near a carrier's period looks like that carrier.", agreement_cost),
+    "standoff": Term(
+        "Assumes objects near the rig's standoff, true of fixed placement.", standoff_cost
+    ),
+    "agreement": Term(
+        "Assumes that no texture near a carrier's period looks like that carrier.", agreement_cost
+    ),
     "pixel light": Term("Assumes that light from other surfaces changes slowly.", pixel_light_cost),
 }
-"""Beside them, range and continuity count always: a candidate beyond the working range does not exist, and neighbours
-belong to one surface, except where the phase or the brightness jumps."""
+"""Beside them, range and continuity count always: a candidate beyond the working range does not
+exist, and neighbours belong to one surface, except where the phase or the brightness jumps."""
 
 
 def terms_of(settings: Settings) -> list[str]:
@@ -154,19 +182,23 @@ def cost_of(names: Sequence[str], seen: Capture, offered: Candidates, settings: 
 
 
 def solved(offered: Candidates, cost: Image, smoothness: float) -> tuple[NDArray[np.int32], Image]:
-    """Index of the candidate of least energy, int32 (h, w), and the margin of the energy (0 for a tie)."""
+    """Index of the candidate of least energy, int32 (h, w), and the margin of the energy (0 for a
+    tie)."""
     from fpp_ml_bench.baselines.phase.labels import least_energy  # compiled when it is imported
 
-    unary = np.where(offered.inside, np.where(offered.exists, cost, LARGE), np.float32(0)).astype(np.float32)
+    unary = np.where(offered.inside, np.where(offered.exists, cost, LARGE), np.float32(0)).astype(
+        np.float32
+    )
     link_x, link_y = (np.float32(smoothness) * link for link in offered.links)
     return least_energy(unary, offered.phase_rad, link_x, link_y, JUMP_RAD)
 
 
 @dataclass(frozen=True)
 class FringeOrder:
-    """Fringes of one direction with the ``order`` of every pixel, int32 (h, w), and its ``margin``, float32 (h, w): how
-    clearly it won, 0 for a tie, 1 or more for certain. A pixel of less than ``least_margin`` gets no depth. Raises
-    `DecodeError` for maps that are not of the observation's crop."""
+    """Fringes of one direction with the ``order`` of every pixel, int32 (h, w), and its ``margin``,
+    float32 (h, w): how clearly it won, 0 for a tie, 1 or more for certain. A pixel of less than
+    ``least_margin`` gets no depth. Raises `DecodeError` for maps that are not of the observation's
+    crop."""
 
     seen: Observation
     order: NDArray[np.int32]
@@ -177,7 +209,8 @@ class FringeOrder:
         shape = self.seen.inside.shape
         if np.shape(self.order) != shape or np.shape(self.margin) != shape:
             raise DecodeError(
-                f"expected an order and a margin for each of the {shape} pixels (h, w) around the object, got "
+                f"expected an order and a margin for each of the {shape} pixels (h, w) around the "
+                f"object, got "
                 f"{np.shape(self.order)} and {np.shape(self.margin)}"
             )
 
@@ -189,21 +222,32 @@ def fringe_order(settings: Settings, seen: Observation, offered: FringeCandidate
     largest = max(SHADING_COST * SHADING_LIMIT * settings.shading, PRIOR_COST)
     proof = cost / np.float32(largest)
     proof[~offered.exists] = 2.0
-    margin = np.minimum(margin / np.float32(JUMP_RAD), _evidence(proof, index, seen, offered.inside))
-    chosen_rad, margin = (seen.spread(values) for values in (chosen_values(offered.phase_rad, index), margin))
+    margin = np.minimum(
+        margin / np.float32(JUMP_RAD), _evidence(proof, index, seen, offered.inside)
+    )
+    chosen_rad, margin = (
+        seen.spread(values) for values in (chosen_values(offered.phase_rad, index), margin)
+    )
     # A pixel takes the order whose residual phase is nearest to that of its grid point.
-    order = np.rint((chosen_rad - seen.layer.residual_phase(seen.phase_rad, 0.0)) / TAU).astype(np.int32)
+    order = np.rint((chosen_rad - seen.layer.residual_phase(seen.phase_rad, 0.0)) / TAU).astype(
+        np.int32
+    )
     return FringeOrder(seen, order, margin)
 
 
 def _evidence(proof: Image, choice: NDArray[np.int32], seen: Observation, inside: Mask) -> Image:
-    """By how much the cost of the second-best order exceeds that of the choice, averaged over object pixels nearby."""
+    """By how much the cost of the second-best order exceeds that of the choice, averaged over
+    object pixels nearby."""
     if len(proof) == 1:
         return np.full(choice.shape, 2.0, np.float32)
-    gap = ((_rivals(proof, choice, np.inf).min(axis=0) - chosen_values(proof, choice)) * inside).astype(np.float32)
+    gap = (
+        (_rivals(proof, choice, np.inf).min(axis=0) - chosen_values(proof, choice)) * inside
+    ).astype(np.float32)
     side = 2 * max(1, round(EVIDENCE_PERIODS * seen.period_px / seen.stride / 2)) + 1
     maps = (gap, inside.astype(np.float32))
-    mean_gap, share = (cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT) for values in maps)
+    mean_gap, share = (
+        cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT) for values in maps
+    )
     return mean_gap / np.maximum(share, 1e-3)  # type: ignore[return-value]  # cv2 keeps float32
 
 
@@ -216,8 +260,9 @@ def _rivals(cost: Image, choice: NDArray[np.int32], ruled_out: float | np.float3
 
 @dataclass(frozen=True)
 class Turns:
-    """Maps (3, h, w) of a turn further than the chosen order, that order, and a turn nearer: ``nearness`` float32,
-    ``misfit_rad``: distance of both phases from those there, and whether it ``exists``."""
+    """Maps (3, h, w) of a turn further than the chosen order, that order, and a turn nearer:
+    ``nearness`` float32, ``misfit_rad``: distance of both phases from those there, and whether it
+    ``exists``."""
 
     nearness: NDArray[np.float32]
     misfit_rad: Image
@@ -226,9 +271,10 @@ class Turns:
 
 @dataclass(frozen=True)
 class CrossedOrder:
-    """The order of crossed fringes, maps (h, w): ``candidates``; ``margin``: energy of the rival order minus that of
-    the chosen one; ``evidence``: the same difference for the cost of the evidence alone; ``rival``: nearness of the
-    best candidate but the chosen one, the chosen one's own where there is no other."""
+    """The order of crossed fringes, maps (h, w): ``candidates``; ``margin``: energy of the rival
+    order minus that of the chosen one; ``evidence``: the same difference for the cost of the
+    evidence alone; ``rival``: nearness of the best candidate but the chosen one, the chosen one's
+    own where there is no other."""
 
     candidates: Turns
     margin: Image
@@ -236,18 +282,26 @@ class CrossedOrder:
     rival: Image
 
 
-def crossed_order(settings: Settings, seen: CrossedObservation, offered: CrossedCandidates) -> CrossedOrder:
+def crossed_order(
+    settings: Settings, seen: CrossedObservation, offered: CrossedCandidates
+) -> CrossedOrder:
     """The order of every pixel of crossed fringes."""
     terms, smoothness, evidence_weight = ["agreement"], 1.0, 1.0
     if seen.moved is not None:
-        terms, smoothness, evidence_weight = ["agreement", "pixel light"], SMOOTHNESS, EVIDENCE_WEIGHT
+        terms, smoothness, evidence_weight = (
+            ["agreement", "pixel light"],
+            SMOOTHNESS,
+            EVIDENCE_WEIGHT,
+        )
     cost = cost_of(terms, seen, offered, settings)
     cost = np.where(offered.exists, cost * offered.trust, LARGE).astype(np.float32)
     index, margin = solved(offered, cost, smoothness)
     evidence = _rivals(cost, index, LARGE).min(axis=0) - chosen_values(cost, index)
     evidence = np.minimum(evidence, np.float32(MOST_AGREEMENT)).astype(np.float32)
     misfit = _rivals(np.where(offered.exists, offered.misfit_rad, LARGE), index, LARGE)
-    rival = chosen_values(offered.nearness, np.where(misfit.min(axis=0) < LARGE, misfit.argmin(axis=0), index))
+    rival = chosen_values(
+        offered.nearness, np.where(misfit.min(axis=0) < LARGE, misfit.argmin(axis=0), index)
+    )
     count = len(offered.nearness)
     place = index + np.array([-1, 0, 1])[:, None, None]
     nearness, misfit, exists = (
@@ -264,8 +318,9 @@ def crossed_order(settings: Settings, seen: CrossedObservation, offered: Crossed
 
 
 def local_median(values: Image, inside: Mask, window_px: float) -> Image:
-    """Median of ``values`` (h, w) over the square of ``window_px`` around each pixel, in steps of `MEDIAN_STEP` between
-    -127 and 127 of them; beyond ``inside`` they are those of the nearest pixel within."""
+    """Median of ``values`` (h, w) over the square of ``window_px`` around each pixel, in steps of
+    `MEDIAN_STEP` between -127 and 127 of them; beyond ``inside`` they are those of the nearest
+    pixel within."""
     levels = np.clip(np.rint(values / np.float32(MEDIAN_STEP)), -127, 127).astype(np.int16)
     levels = levels[nearest_inside(inside)]
     size = 2 * int(window_px / 2) + 1
@@ -274,12 +329,16 @@ def local_median(values: Image, inside: Mask, window_px: float) -> Image:
 
 
 def margin_by_range(seen: Observation, order: NDArray[np.int32]) -> Image:
-    """Margin of ``order`` (h, w), float32: `SURE` where range and continuity rule every other order out, `LIKELY` where
-    the range leaves a pixel alone one order, or beside a settled surface that it continues, else 0."""
+    """Margin of ``order`` (h, w), float32: `SURE` where range and continuity rule every other order
+    out, `LIKELY` where the range leaves a pixel alone one order, or beside a settled surface that
+    it continues, else 0."""
     residual = seen.layer.residual_phase(seen.phase_rad, order)
-    # Misfit of the fringe in the first frame over its brightness, on the scale of a depth edge's line.
+    # Misfit of the fringe in the first frame over its brightness, on the scale of a depth edge's
+    # line.
     light = seen.greys[0] - np.float32(seen.background.ambient_grey) - seen.fit.light
-    relative = np.where(seen.inside, light / np.maximum(seen.fit.brightness, 1), 0).astype(np.float32)
+    relative = np.where(seen.inside, light / np.maximum(seen.fit.brightness, 1), 0).astype(
+        np.float32
+    )
     misfit = np.sqrt(cv2.GaussianBlur(relative * relative, (0, 0), MISFIT_PERIODS * seen.period_px))
     steepness = np.hypot(*_slopes(residual, seen.inside)) * seen.period_px / TAU
     smooth = seen.inside & (steepness < STEEPEST_PERIODS) & (misfit < LARGEST_MISFIT)
@@ -289,7 +348,10 @@ def margin_by_range(seen: Observation, order: NDArray[np.int32]) -> Image:
     areas = stats[:, cv2.CC_STAT_AREA]
     settled = areas >= LEAST_AREA_PERIODS * square
     settled[0] = False
-    for rival in (-1, 1):  # the range is an interval: an order further away leaves it with more pixels
+    for rival in (
+        -1,
+        1,
+    ):  # the range is an interval: an order further away leaves it with more pixels
         outside = np.bincount(labels[~_in_range(seen, order + rival)], minlength=count)
         settled &= (outside > OUT_SHARE * areas) & (outside > OUT_AREA_PERIODS * square)
     settled &= np.bincount(labels[~_in_range(seen, order)], minlength=count) < OUT_SHARE * areas
@@ -312,5 +374,7 @@ def _slopes(residual_rad: Image, inside: Mask) -> tuple[Image, Image]:
     slopes = []
     for axis, link in zip((1, 0), links_between(inside), strict=True):
         change = np.abs(np.diff(residual_rad, axis=axis)) * link
-        slopes.append(np.maximum(*(np.insert(change, place, 0, axis) for place in (0, change.shape[axis]))))
+        slopes.append(
+            np.maximum(*(np.insert(change, place, 0, axis) for place in (0, change.shape[axis])))
+        )
     return slopes[0], slopes[1]

@@ -1,8 +1,9 @@
 """A method's way from frames to depth: four stops, put together of parts.
 
-What a rig photographs is a *measurement model*, one carrier (`OneCarrier`) or two (`TwoCarriers`); `one_carrier` and
-`two_carriers` put its measured parts together. A learned method gives parts of its own: what measures the ``phases`` of
-an observation, or what a network makes of the chosen order, its mask and its phase (``learned``).
+What a rig photographs is a *measurement model*, one carrier (`OneCarrier`) or two (`TwoCarriers`);
+`one_carrier` and `two_carriers` put its measured parts together. A learned method gives parts of
+its own: what measures the ``phases`` of an observation, or what a network makes of the chosen
+order, its mask and its phase (``learned``).
 
 >>> from fpp_ml_bench.baselines.phase.observe import OneCarrier
 >>> route = one_carrier(OneCarrier(rig))
@@ -50,8 +51,8 @@ Measured_co = TypeVar("Measured_co", bound=Measurement, covariant=True)
 
 @dataclass(frozen=True)
 class Route(Generic[ModelT, Seen, Offered, Chosen, Measured]):
-    """The parts of a route, each a function of what the part before it gave. ``phases`` and ``learned`` change it, or
-    are None in a route in which nothing is learned."""
+    """The parts of a route, each a function of what the part before it gave. ``phases`` and
+    ``learned`` change it, or are None in a route in which nothing is learned."""
 
     model: ModelT
     observe: Callable[[Frames, Mask | None], Seen]
@@ -62,13 +63,15 @@ class Route(Generic[ModelT, Seen, Offered, Chosen, Measured]):
     learned: Callable[[Chosen], Chosen] | None = None
 
     def measure(self, frames: Frames, mask: Mask | None = None) -> Measured:
-        """Depth and the maps behind it, of captured frames uint8 (H, W) or float32 grey levels of the same range: one,
-        or as many as the model has. ``mask`` bool (H, W) replaces the object mask that is found. Raises `DecodeError`
-        for another number, dtype or shape."""
-        # What the frames show before any order is chosen: background, object mask, phase and brightness.
+        """Depth and the maps behind it, of captured frames uint8 (H, W) or float32 grey levels of
+        the same range: one, or as many as the model has. ``mask`` bool (H, W) replaces the object
+        mask that is found. Raises `DecodeError` for another number, dtype or shape."""
+        # What the frames show before any order is chosen: background, object mask, phase and
+        # brightness.
         seen = self.observe(frames, mask)
         chosen = self.choose(seen)
-        # A network answers for the mask, the order, and what the phase is off by; the depth is computed all the same.
+        # A network answers for the mask, the order, and what the phase is off by; the depth is
+        # computed all the same.
         if self.learned is not None:
             chosen = self.learned(chosen)
         # Closed form, with its uncertainty and the reasons not to trust a pixel.
@@ -98,7 +101,9 @@ FringeRoute = Route[OneCarrier, Observation, FringeCandidates, FringeOrder, Frin
 CrossedRoute = Route[TwoCarriers, CrossedObservation, CrossedCandidates, Fitted, Measurement]
 
 
-def one_carrier(model: OneCarrier, learned: Callable[[FringeOrder], FringeOrder] | None = None) -> FringeRoute:
+def one_carrier(
+    model: OneCarrier, learned: Callable[[FringeOrder], FringeOrder] | None = None
+) -> FringeRoute:
     """The route of fringes of one direction."""
     order = partial(fringe_order, model.settings)
     depth = partial(fringe_depth, model)

@@ -1,16 +1,16 @@
-"""The rules of FPP-C: the axes, each of which changes one stage of the image formation at five severities
-(``axes.yaml``), the disturbed views, and the scores: the protocol's two-sided MAE, and how honest the stated
-uncertainty is.
+"""The rules of FPP-C: the axes, each of which changes one stage of the image formation at five
+severities (``axes.yaml``), the disturbed views, and the scores: the protocol's two-sided MAE, and
+how honest the stated uncertainty is.
 
-Of a view only the frames that a method uses are rendered, and kept in a cache: a folder for each condition with a file
-for each frame, which depends on nothing but the condition and the view, so methods share it. The folders that were used
-longest ago go where it would grow beyond its limit.
+Of a view only the frames that a method uses are rendered, and kept in a cache: a folder for each
+condition with a file for each frame, which depends on nothing but the condition and the view, so
+methods share it. The folders that were used longest ago go where it would grow beyond its limit.
 
-Scored are the object pixels of the undisturbed scene that are not void, against its exact depth, and what is answered
-beside the object.
+Scored are the object pixels of the undisturbed scene that are not void, against its exact depth,
+and what is answered beside the object.
 
-After Hendrycks and Dietterich 2019, Benchmarking Neural Network Robustness to Common Corruptions and Perturbations; but
-every corruption is caused in the scene, not painted on the image.
+After Hendrycks and Dietterich 2019, Benchmarking Neural Network Robustness to Common Corruptions
+and Perturbations; but every corruption is caused in the scene, not painted on the image.
 """
 
 import json
@@ -50,7 +50,9 @@ SetName = Literal["test", "unseen"]
 SETS: dict[SetName, tuple[str, ...]] = {"test": TEST_OBJECTS, "unseen": UNSEEN}
 """Objects of each set that a method can be measured on."""
 CLEAN = "clean"
-CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "fpp-ml-bench" / "robustness"
+CACHE = (
+    Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "fpp-ml-bench" / "robustness"
+)
 LIMIT_BYTES = 10_000_000_000
 Frames = list[NDArray[np.uint8] | None]
 Share = Annotated[float, Field(gt=0, le=1)]
@@ -58,11 +60,12 @@ Above0 = Annotated[float, Field(gt=0)]
 
 
 class Axis(StrictModel):
-    """One corruption: ``key`` of the light's ``stage`` (the light itself with none) takes the values ``severities``,
-    in ``unit``, and ``also`` holds what else the stage needs. ``electrons``: the values are grey levels, the key wants
-    electrons. ``several_frames``: it does nothing to one frame. ``objects``: only these are disturbed by it.
-    ``beside``: it does not count in the mean over axes. ``drawn``: trainings draw it, unless their recipe holds it out;
-    ``held_out``: those of today do."""
+    """One corruption: ``key`` of the light's ``stage`` (the light itself with none) takes the
+    values ``severities``, in ``unit``, and ``also`` holds what else the stage needs. ``electrons``:
+    the values are grey levels, the key wants electrons. ``several_frames``: it does nothing to one
+    frame. ``objects``: only these are disturbed by it. ``beside``: it does not count in the mean
+    over axes. ``drawn``: trainings draw it, unless their recipe holds it out; ``held_out``: those
+    of today do."""
 
     unit: Text
     stage: Literal["", "projector", "surface", "bounces", "camera"] = ""
@@ -95,8 +98,9 @@ class Axis(StrictModel):
 
 
 class Corruptions(StrictModel):
-    """``axes.yaml``. ``views`` of each object of a set are measured. An error above ``wrong_order_mm`` is a wrong
-    order, and a confident one where the stated sigma is below ``confident_below`` of it."""
+    """``axes.yaml``. ``views`` of each object of a set are measured. An error above
+    ``wrong_order_mm`` is a wrong order, and a confident one where the stated sigma is below
+    ``confident_below`` of it."""
 
     version: Annotated[int, Field(ge=1)]
     light: Text
@@ -110,7 +114,8 @@ class Corruptions(StrictModel):
         return named_light(self.light)
 
     def chosen(self, names: Sequence[str]) -> dict[str, Axis]:
-        """The axes ``names``, in the file's order, all with none given; PredictionError for an unknown name."""
+        """The axes ``names``, in the file's order, all with none given; PredictionError for an
+        unknown name."""
         unknown = [name for name in names if name not in self.axes]
         if unknown:
             raise PredictionError(f"unknown axis {unknown[0]!r}; there are {', '.join(self.axes)}")
@@ -120,7 +125,9 @@ class Corruptions(StrictModel):
 @cache
 def corruptions() -> Corruptions:
     """The axes that come with the package."""
-    return validate(Corruptions, strict_yaml(FILE.read_text(encoding="utf-8")), FILE, "axes", PredictionError)
+    return validate(
+        Corruptions, strict_yaml(FILE.read_text(encoding="utf-8")), FILE, "axes", PredictionError
+    )
 
 
 Scores = dict[str, float | None]
@@ -129,8 +136,8 @@ SCORES = tuple(SeverityScores.model_fields)
 
 
 class Truth(NamedTuple):
-    """``depth_mm`` float32 (H, W) of an undisturbed view; bool (H, W): the object pixels ``scored``, and the background
-    pixels ``empty``; void ones are neither."""
+    """``depth_mm`` float32 (H, W) of an undisturbed view; bool (H, W): the object pixels
+    ``scored``, and the background pixels ``empty``; void ones are neither."""
 
     depth_mm: NDArray[np.float32]
     scored: NDArray[np.bool_]
@@ -139,8 +146,8 @@ class Truth(NamedTuple):
 
 @dataclass(frozen=True)
 class Condition:
-    """An axis at a severity, 1 to 5, for the objects ``objects`` seen at ``size`` px; severity 0 is the clean scene.
-    ``rig``: one of `optics.NAMED_RIGS`."""
+    """An axis at a severity, 1 to 5, for the objects ``objects`` seen at ``size`` px; severity 0 is
+    the clean scene. ``rig``: one of `optics.NAMED_RIGS`."""
 
     axis: str
     severity: int
@@ -151,12 +158,17 @@ class Condition:
     @property
     def settings(self) -> BuildSettings:
         rules = corruptions()
-        light = rules.clean if self.axis == CLEAN else rules.axes[self.axis].light(rules.clean, self.severity)
+        light = (
+            rules.clean
+            if self.axis == CLEAN
+            else rules.axes[self.axis].light(rules.clean, self.severity)
+        )
         return BuildSettings(rig=NAMED_RIGS[self.rig](self.size), objects=self.objects, light=light)
 
     @cache  # noqa: B019  of a few conditions
     def key(self, frames: tuple[int, ...]) -> str:
-        """Name of the condition's folder. Where the object moves, each frame's place depends on which are captured."""
+        """Name of the condition's folder. Where the object moves, each frame's place depends on
+        which are captured."""
         described = self.settings.describe()
         del described["objects"]
         moving = frames if described["light"]["motion_mm"] else ()
@@ -172,17 +184,23 @@ class FrameCache:
         self.folder = folder
 
     def frames(self, condition: Condition, name: str, view: str, wanted: Sequence[int]) -> Frames:
-        """The sequence of a view with the frames ``wanted``, uint8 (H, W) each, and None for the others. A moving
-        object rests halfway through the frames, which are captured one after another."""
+        """The sequence of a view with the frames ``wanted``, uint8 (H, W) each, and None for the
+        others. A moving object rests halfway through the frames, which are captured one after
+        another."""
         studio = _studio(condition)
-        files = {index: self._file(condition, wanted, f"{sample_name(name, view)}-{index:02d}") for index in wanted}
+        files = {
+            index: self._file(condition, wanted, f"{sample_name(name, view)}-{index:02d}")
+            for index in wanted
+        }
         out: Frames = [None] * len(studio.rig.sequence)
         for index, file in files.items():
             out[index] = _load(file)
         missing = tuple(index for index in wanted if out[index] is None)
         if missing and studio.light.motion_mm:
             middle = (len(wanted) - 1) / 2
-            studio.expose_moving(_mesh(name), view, {index: wanted.index(index) - middle for index in missing})
+            studio.expose_moving(
+                _mesh(name), view, {index: wanted.index(index) - middle for index in missing}
+            )
         elif missing:
             studio.expose(studio.trace(_mesh(name), view), missing)
         for index in missing:
@@ -204,7 +222,8 @@ class FrameCache:
         return Truth(kept[0], kept[1] > 0, kept[2] > 0)
 
     def make_room(self, needed_bytes: int, limit_bytes: int = LIMIT_BYTES) -> None:
-        """Remove the folders that were used longest ago until ``needed_bytes`` more stay below the limit."""
+        """Remove the folders that were used longest ago until ``needed_bytes`` more stay below the
+        limit."""
         if self.folder is None or not self.folder.is_dir():
             return
         entries = [entry for entry in self.folder.iterdir() if entry.is_dir()]
@@ -217,7 +236,11 @@ class FrameCache:
             total -= sizes[entry]
 
     def _file(self, condition: Condition, wanted: Sequence[int], name: str) -> Path | None:
-        return None if self.folder is None else self.folder / condition.key(tuple(wanted)) / f"{name}.npy"
+        return (
+            None
+            if self.folder is None
+            else self.folder / condition.key(tuple(wanted)) / f"{name}.npy"
+        )
 
 
 _mesh = lru_cache(maxsize=max(map(len, SETS.values())))(solid_mesh)
@@ -251,7 +274,9 @@ def _save(file: Path | None, array: NDArray) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, content.getvalue(), sync=False)
     except OSError as error:
-        raise PredictionError(f"{file}: can't be written ({error.strerror}); free some space, or --no-cache") from error
+        raise PredictionError(
+            f"{file}: can't be written ({error.strerror}); free some space, or --no-cache"
+        ) from error
 
 
 def score(
@@ -261,17 +286,21 @@ def score(
     rules: Corruptions,
     charge_mm: float,
 ) -> Scores:
-    """`SCORES` of a prediction (H, W) in mm, 0 or less without an answer (a network may go below 0), whose standard
-    uncertainty is ``sigma_mm`` (H, W), above 0 where it is stated; ``charge_mm`` is what a missed or invented pixel
-    costs. Raises PredictionError for a depth that is not finite, a sigma that is not finite or below 0, and for another
-    size."""
+    """`SCORES` of a prediction (H, W) in mm, 0 or less without an answer (a network may go below
+    0), whose standard uncertainty is ``sigma_mm`` (H, W), above 0 where it is stated; ``charge_mm``
+    is what a missed or invented pixel costs. Raises PredictionError for a depth that is not finite,
+    a sigma that is not finite or below 0, and for another size."""
     for name, values in (("depth", depth_mm), ("sigma", sigma_mm)):
         if values is None:
             continue
         if values.shape != truth.depth_mm.shape:
-            raise PredictionError(f"{name}: expected a map of {truth.depth_mm.shape}, got {values.shape}")
+            raise PredictionError(
+                f"{name}: expected a map of {truth.depth_mm.shape}, got {values.shape}"
+            )
         if not np.isfinite(values).all() or (name == "sigma" and (values < 0).any()):
-            raise PredictionError(f"{name}: expected finite mm, a sigma of 0 and more; the method is at fault")
+            raise PredictionError(
+                f"{name}: expected finite mm, a sigma of 0 and more; the method is at fault"
+            )
     target = truth.depth_mm[truth.scored].astype(np.float64)
     if target.size == 0:
         return dict.fromkeys(SCORES)
@@ -291,9 +320,13 @@ def score(
     if sigma_mm is not None:
         sigma = sigma_mm[truth.scored].astype(np.float64)
         stated = states_sigma(given, sigma)
-        scores["confident_share"] = float((wrong & stated & (sigma < rules.confident_below * error)).mean())
+        scores["confident_share"] = float(
+            (wrong & stated & (sigma < rules.confident_below * error)).mean()
+        )
         scores["coverage"] = float(stated.mean())
-        stated_scores = score_sigma(depth_mm, truth.depth_mm, sigma_mm, ~(truth.scored | truth.empty), charge_mm)
+        stated_scores = score_sigma(
+            depth_mm, truth.depth_mm, sigma_mm, ~(truth.scored | truth.empty), charge_mm
+        )
         scores |= {f"sure_{name}": stated_scores.sure_mm(name) for name in ("mae_mm", "rmse_mm")}
     return scores
 

@@ -1,5 +1,6 @@
-"""Measures a method axis by axis: predicts disturbed views in several processes, writes a file for each finished axis,
-and summarises them: means by severity, the mean over all of them, its interval, and the page of all methods."""
+"""Measures a method axis by axis: predicts disturbed views in several processes, writes a file for
+each finished axis, and summarises them: means by severity, the mean over all of them, its interval,
+and the page of all methods."""
 
 import json
 from collections import Counter
@@ -43,7 +44,8 @@ Work = tuple[Method, Condition, FrameCache, tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Setup:
-    """A method on a set, at an image size. ``quick``: one view of each object and three severities, for a look."""
+    """A method on a set, at an image size. ``quick``: one view of each object and three severities,
+    for a look."""
 
     method: Method
     set_name: SetName
@@ -53,7 +55,8 @@ class Setup:
     def __post_init__(self) -> None:
         if self.method.units != "mm":
             raise PredictionError(
-                f"{self.method.title}: predicts normalised depth; robustness is measured in mm, which networks of raw "
+                f"{self.method.title}: predicts normalised depth; robustness is measured in mm, "
+                f"which networks of raw "
                 "or global normalisation predict"
             )
 
@@ -69,10 +72,14 @@ class Setup:
     def axes(self, names: Sequence[str]) -> list[str]:
         """`CLEAN`, and those of ``names`` (all with none) that apply to the method and the set."""
         chosen, frames = corruptions().chosen(names), len(self.method.frames_used)
-        return [CLEAN, *(name for name, axis in chosen.items() if axis.applies(SETS[self.set_name], frames))]
+        return [
+            CLEAN,
+            *(name for name, axis in chosen.items() if axis.applies(SETS[self.set_name], frames)),
+        ]
 
     def conditions(self, axis: str) -> list[Condition]:
-        """Those of an axis of `corruptions`, or of `CLEAN`, on the objects of the set that it disturbs."""
+        """Those of an axis of `corruptions`, or of `CLEAN`, on the objects of the set that it
+        disturbs."""
         objects, severities = tuple(SETS[self.set_name]), self.severities
         if axis == CLEAN:
             severities = (0,)
@@ -115,10 +122,11 @@ def measure(
     cluster: str | None = None,
     saved: Callable[[], None] = lambda: None,
 ) -> dict[str, list[View]]:
-    """The rows of every view by axis, and a file ``out/AXIS.json`` for each axis as soon as it is finished; files that
-    an earlier run of the same setup left are read instead. Views are predicted and scored by so many processes, or by
-    the Ray cluster at an address. ``progress`` is called with a number of views, ``saved`` after each file.
-    Raises PredictionError for files of another setup, `BuildError` where another process is at it, `PoolError`."""
+    """The rows of every view by axis, and a file ``out/AXIS.json`` for each axis as soon as it is
+    finished; files that an earlier run of the same setup left are read instead. Views are predicted
+    and scored by so many processes, or by the Ray cluster at an address. ``progress`` is called
+    with a number of views, ``saved`` after each file. Raises PredictionError for files of another
+    setup, `BuildError` where another process is at it, `PoolError`."""
     with exclusive(out / LOCK_FILE, out, "measuring there"):
         files = {axis: out / f"{axis}.json" for axis in setup.axes(axes)}
         kept = {axis: read_axis(file, setup.key()) for axis, file in files.items()}
@@ -132,8 +140,14 @@ def measure(
             return rows
         with mapping(work, workers, cluster) as mapped:
             for axis in missing:
-                tasks = [(condition, name) for condition in setup.conditions(axis) for name in condition.objects]
-                frames.make_room(len(tasks) * len(setup.views) * len(setup.method.frames_used) * setup.size**2)
+                tasks = [
+                    (condition, name)
+                    for condition in setup.conditions(axis)
+                    for name in condition.objects
+                ]
+                frames.make_room(
+                    len(tasks) * len(setup.views) * len(setup.method.frames_used) * setup.size**2
+                )
                 rows[axis] = []
                 for views in mapped(_measure_object, *zip(*tasks, strict=True)):
                     rows[axis] += views
@@ -149,7 +163,10 @@ def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
     method, clean, cache, views = work
     rules, charge_mm, rows = corruptions(), clean.settings.rig.half_range_mm, []
     for view in views:
-        frames, truth = cache.frames(condition, name, view, method.frames_used), cache.truth(clean, name, view)
+        frames, truth = (
+            cache.frames(condition, name, view, method.frames_used),
+            cache.truth(clean, name, view),
+        )
         if method.uses_ground_truth_mask:
             frames = [None if frame is None else frame * (truth.depth_mm > 0) for frame in frames]
         started = perf_counter()
@@ -163,15 +180,19 @@ def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
 
 
 def read_axis(file: Path, setup: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
-    """What an axis's file holds: ``setup``, ``axis``, ``views``; None where there is none. PredictionError for a
-    damaged one, and for that of another ``setup``."""
+    """What an axis's file holds: ``setup``, ``axis``, ``views``; None where there is none.
+    PredictionError for a damaged one, and for that of another ``setup``."""
     if not file.exists():
         return None
     try:
         content: dict[str, Any] = read_json(file, PredictionError)
         views = content["views"]
-        complete = bool(views) and all({"sample", "object", "severity", "mae_mm"} <= row.keys() for row in views)
-        complete = complete and isinstance(content["setup"], dict) and isinstance(content["axis"], str)
+        complete = bool(views) and all(
+            {"sample", "object", "severity", "mae_mm"} <= row.keys() for row in views
+        )
+        complete = (
+            complete and isinstance(content["setup"], dict) and isinstance(content["axis"], str)
+        )
     except (ValueError, KeyError, TypeError, AttributeError):
         complete = False
     if not complete:
@@ -179,23 +200,31 @@ def read_axis(file: Path, setup: Mapping[str, Any] | None = None) -> dict[str, A
     wanted = json.loads(json.dumps(setup or {}))
     if other := [name for name in wanted if content["setup"].get(name) != wanted[name]]:
         raise PredictionError(
-            f"{file}: holds another measurement (other {', '.join(other)}); give another folder, or delete it"
+            f"{file}: holds another measurement (other {', '.join(other)}); give another folder, "
+            f"or delete it"
         )
     return content
 
 
 def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
-    """The block of ``result.json``. Raises PredictionError for a quick look, and where an axis is missing."""
+    """The block of ``result.json``. Raises PredictionError for a quick look, and where an axis is
+    missing."""
     missing = [axis for axis in setup.axes(()) if axis not in rows]
     if setup.quick or missing:
         lacking = "a --quick look" if setup.quick else f"without {', '.join(missing)}"
-        raise PredictionError(f"robustness is a mean over all axes and severities, and this is {lacking}")
+        raise PredictionError(
+            f"robustness is a mean over all axes and severities, and this is {lacking}"
+        )
     axes = {
         axis: [SeverityScores.model_validate(scores) for scores in severity_means(found).values()]
         for axis, found in rows.items()
     }
     (clean,) = axes.pop(CLEAN)
-    beside = {name: axes.pop(name) for name, axis in corruptions().axes.items() if axis.beside and name in axes}
+    beside = {
+        name: axes.pop(name)
+        for name, axis in corruptions().axes.items()
+        if axis.beside and name in axes
+    }
     found = object_interval(*_shares_of_the_mean({axis: rows[axis] for axis in (CLEAN, *axes)}))
     every = [scores.mae_mm for severities in axes.values() for scores in severities]
     return Robustness(
@@ -215,8 +244,9 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
 
 
 def _shares_of_the_mean(rows: Mapping[str, Sequence[View]]) -> tuple[list[float], list[str]]:
-    """For each sample what it adds to the mean over axes and severities, times the number of samples, and its object:
-    the mean of these numbers is that mean, also where an axis disturbs a few objects only."""
+    """For each sample what it adds to the mean over axes and severities, times the number of
+    samples, and its object: the mean of these numbers is that mean, also where an axis disturbs a
+    few objects only."""
     objects = {row["sample"]: row["object"] for row in rows[CLEAN]}
     sums = dict.fromkeys(objects, 0.0)
     disturbed = [(axis, row) for axis, views in rows.items() if axis != CLEAN for row in views]
@@ -235,11 +265,13 @@ class Measured:
     means: dict[str, dict[int, dict[str, float | None]]]
 
     def mean(self, key: str = "mae_mm", axis: str | None = None) -> float | None:
-        """Mean of a score over the severities of an axis, or of all that count, that were measured; None where one is
-        unknown."""
+        """Mean of a score over the severities of an axis, or of all that count, that were measured;
+        None where one is unknown."""
         counted = (name for name, one in corruptions().axes.items() if not one.beside)
         axes = set(counted) if axis is None else {axis}
-        values = [scores[key] for name, by in self.means.items() if name in axes for scores in by.values()]
+        values = [
+            scores[key] for name, by in self.means.items() if name in axes for scores in by.values()
+        ]
         return None if None in values else mean_of(values)
 
 
@@ -278,7 +310,11 @@ def write_page(out: Path) -> Path:
 def draw_curves(measured: Sequence[Measured]) -> bytes:
     """A panel for each axis: mean error against severity, a line a method; PNG."""
     rules = corruptions()
-    axes = {name: axis for name, axis in rules.axes.items() if any(name in one.means for one in measured)}
+    axes = {
+        name: axis
+        for name, axis in rules.axes.items()
+        if any(name in one.means for one in measured)
+    }
     drawn, panels_of = panels([f"{name}, {axis.unit}" for name, axis in axes.items()], 4, 3.3, 2.9)
     for panel, (name, axis) in zip(panels_of, axes.items(), strict=True):
         for number, one in enumerate(measured):
@@ -291,6 +327,8 @@ def draw_curves(measured: Sequence[Measured]) -> bytes:
             errors = np.array([scores.get("mae_mm") for scores in points.values()], dtype=float)
             colour = LINE_COLOURS[number % len(LINE_COLOURS)]
             panel.plot(list(points), errors, style, color=colour, label=label, **LINE)
-        panel.set(xticks=range(6), xticklabels=["clean", *(f"{value:g}" for value in axis.severities)])
+        panel.set(
+            xticks=range(6), xticklabels=["clean", *(f"{value:g}" for value in axis.severities)]
+        )
         panel.set(yscale="log", ylim=(0.1, 1000), ylabel="two-sided MAE, mm")
     return with_legend(drawn, 3)

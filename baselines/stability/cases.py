@@ -1,9 +1,11 @@
-"""Stability cases: how they are declared, run, judged and reported: JSON with every case, and a picture of them all.
+"""Stability cases: how they are declared, run, judged and reported: JSON with every case, and a
+picture of them all.
 
-A case runs a computation of the benchmark where it is ill-conditioned, and compares it with a reliable reference:
-50-digit arithmetic, a closed form, or exact sums. The error is compared with a bound from theory: a condition number
-times the unit round-off, or the propagation of noise and quantisation. The bound comes from the derivation that the
-case states, never from the measured error.
+A case runs a computation of the benchmark where it is ill-conditioned, and compares it with a
+reliable reference: 50-digit arithmetic, a closed form, or exact sums. The error is compared with a
+bound from theory: a condition number times the unit round-off, or the propagation of noise and
+quantisation. The bound comes from the derivation that the case states, never from the measured
+error.
 """
 
 import json
@@ -43,17 +45,18 @@ GROUPS = {
 }
 """Groups of cases, and the module that declares them; only ``networks`` imports torch."""
 VERDICTS = {"within": "#2f9470", "flagged": "#8d96a0", "FAIL": "#d1242f"}
-"""The verdicts of a case, and their colours: the error is within its bound; correctly refused, by an exception or an
-invalid mask; anything else."""
+"""The verdicts of a case, and their colours: the error is within its bound; correctly refused, by
+an exception or an invalid mask; anything else."""
 _SMALLEST_RATIO = 1e-6
 """What the picture shows of smaller ones."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The measurement of a case at its worst element, which has the largest error / bound. ``error`` is None where the
-    code refused to compute; ``note`` then holds its message. ``flagged_share``: share of elements that were refused.
-    ``condition``: the condition number behind the bound, if any."""
+    """The measurement of a case at its worst element, which has the largest error / bound.
+    ``error`` is None where the code refused to compute; ``note`` then holds its message.
+    ``flagged_share``: share of elements that were refused. ``condition``: the condition number
+    behind the bound, if any."""
 
     error: float | None
     bound: float = 0.0
@@ -76,10 +79,11 @@ def wrong(note: str = "") -> Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """An ill-conditioned or extreme case. ``run`` gives the `Outcome` for the ``parameters``. ``computes``,
-    ``reference`` and ``predicts`` describe in a line each what is computed, its reference, and how the bound is
-    derived. ``expects``: a number, a refusal (an `FppBenchError`, or every element masked), or either. ``heavy`` cases
-    take seconds or gigabytes and are left out of a quick run."""
+    """An ill-conditioned or extreme case. ``run`` gives the `Outcome` for the ``parameters``.
+    ``computes``, ``reference`` and ``predicts`` describe in a line each what is computed, its
+    reference, and how the bound is derived. ``expects``: a number, a refusal (an `FppBenchError`,
+    or every element masked), or either. ``heavy`` cases take seconds or gigabytes and are left out
+    of a quick run."""
 
     group: str
     family: str
@@ -95,7 +99,9 @@ class Case:
     @property
     def name(self) -> str:
         """``family, parameter value, ...``"""
-        return ", ".join([self.family, *(f"{key} {value}" for key, value in self.parameters.items())])
+        return ", ".join(
+            [self.family, *(f"{key} {value}" for key, value in self.parameters.items())]
+        )
 
 
 CASES: list[Case] = []
@@ -114,16 +120,29 @@ def family(
     heavy: Callable[..., bool] = lambda **_: False,
     **grid: Iterable[float | str],
 ) -> Callable[[Run], Run]:
-    """Declare a function as a family of `CASES`: a case for each combination of the grid's values, which the function,
-    ``expects`` and ``heavy`` get by name. Its docstring says what it computes, ``against`` what reference, and
-    ``bound`` how theory predicts the error."""
+    """Declare a function as a family of `CASES`: a case for each combination of the grid's values,
+    which the function, ``expects`` and ``heavy`` get by name. Its docstring says what it computes,
+    ``against`` what reference, and ``bound`` how theory predicts the error."""
 
     def declare(run: Run) -> Run:
         computes = " ".join((run.__doc__ or "").split())
         for values in product(*grid.values()):
             given = dict(zip(grid, values, strict=True))
             expected = expects(**given) if callable(expects) else expects
-            CASES.append(Case(group, name, given, computes, against, bound, unit, run, expected, heavy(**given)))
+            CASES.append(
+                Case(
+                    group,
+                    name,
+                    given,
+                    computes,
+                    against,
+                    bound,
+                    unit,
+                    run,
+                    expected,
+                    heavy(**given),
+                )
+            )
         return run
 
     return declare
@@ -142,8 +161,8 @@ def all_cases(groups: Iterable[str] = tuple(GROUPS), quick: bool = False) -> lis
 
 @dataclass(frozen=True)
 class Row:
-    """A case with its outcome; ``against`` is the reason where it failed, ``cpu_seconds`` the processor time of all
-    threads, so that a busy machine does not show."""
+    """A case with its outcome; ``against`` is the reason where it failed, ``cpu_seconds`` the
+    processor time of all threads, so that a busy machine does not show."""
 
     case: Case
     outcome: Outcome
@@ -157,8 +176,8 @@ class Row:
 
 
 def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: None) -> list[Row]:
-    """Run cases in order; ``done`` is called with each row. An error of the package is a refusal, any other exception
-    of the code under test a FAIL, which does not end the run."""
+    """Run cases in order; ``done`` is called with each row. An error of the package is a refusal,
+    any other exception of the code under test a FAIL, which does not end the run."""
     rows = []
     for case in cases:
         started = time.process_time()
@@ -181,7 +200,10 @@ def judge(case: Case, outcome: Outcome) -> str:
     if not math.isfinite(outcome.bound):
         return "theory predicts no finite error, so the number is meaningless and should be refused"
     if not outcome.error <= outcome.bound:  # NaN is not
-        return f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}{outcome.note and f': {outcome.note}'}"
+        return (
+            f"error {outcome.error:.3g} exceeds its bound "
+            f"{outcome.bound:.3g}{outcome.note and f': {outcome.note}'}"
+        )
     if case.expects == "refusal":
         return "gave a number where there is none"
     if case.expects == "number" and outcome.flagged_share:
@@ -190,19 +212,26 @@ def judge(case: Case, outcome: Outcome) -> str:
 
 
 def worst(
-    errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, condition: ArrayLike | None = None
+    errors: ArrayLike,
+    bounds: ArrayLike = 0.0,
+    flagged: ArrayLike = False,
+    condition: ArrayLike | None = None,
 ) -> Outcome:
-    """The outcome of many elements: the worst of those that are not flagged, and the largest of their ``condition``
-    numbers. NaN errors stay NaN."""
+    """The outcome of many elements: the worst of those that are not flagged, and the largest of
+    their ``condition`` numbers. NaN errors stay NaN."""
     largest = None if condition is None else float(np.max(condition))
-    parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
+    parts = np.broadcast_arrays(
+        np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged)
+    )
     error, bound, refused = (np.ravel(part) for part in parts)
     if refused.all():
         return Outcome(None, 0.0, 1.0, "every element is masked", largest)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error == 0, 0.0, error / bound)
     index = int(np.argmax(np.where(refused, -1.0, ratio)))  # the first NaN, if any
-    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), condition=largest)
+    return Outcome(
+        float(error[index]), float(bound[index]), float(refused.mean()), condition=largest
+    )
 
 
 @cache
@@ -220,7 +249,9 @@ def wide(values: ArrayLike) -> NDArray[np.object_]:
     return np.asarray(np.frompyfunc(high_precision().mpf, 1, 1)(np.asarray(values, float)))
 
 
-def minus_arctangent2(sine: NDArray[np.object_], cosine: NDArray[np.object_]) -> NDArray[np.object_]:
+def minus_arctangent2(
+    sine: NDArray[np.object_], cosine: NDArray[np.object_]
+) -> NDArray[np.object_]:
     """-atan2 of mpmath's numbers, in 50 digits."""
     return -np.frompyfunc(high_precision().atan2, 2, 1)(sine, cosine)
 
@@ -231,13 +262,14 @@ def difference(values: NDArray, exact: NDArray[np.object_]) -> Floats:
 
 
 def gamma(operations: float, unit: float = U64) -> float:
-    """Largest relative error of ``operations`` roundings in a row: n u / (1 - n u)  (Higham, Lemma 3.1)."""
+    """Largest relative error of ``operations`` roundings in a row: n u / (1 - n u)  (Higham, Lemma
+    3.1)."""
     return operations * unit / (1 - operations * unit)
 
 
 def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """By group, and under "all": cases per verdict, the largest error / bound (None where nothing was computed), and
-    processor time."""
+    """By group, and under "all": cases per verdict, the largest error / bound (None where nothing
+    was computed), and processor time."""
     groups: dict[str, dict[str, Any]] = {}
     for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
         part = [row for row in rows if group in (row.case.group, "all")]
@@ -255,7 +287,12 @@ def document(rows: Sequence[Row]) -> dict[str, Any]:
     """The whole run as JSON values; NaN and infinity by name."""
     cases = []
     for row in rows:
-        content = {**vars(row.case), "verdict": row.verdict, **vars(row.outcome), "ratio": row.outcome.ratio}
+        content = {
+            **vars(row.case),
+            "verdict": row.verdict,
+            **vars(row.outcome),
+            "ratio": row.outcome.ratio,
+        }
         content |= {"against": row.against, "cpu_seconds": round(row.cpu_seconds, 3)}
         cases.append({key: value for key, value in content.items() if key not in ("run", "heavy")})
     content = {
@@ -264,14 +301,16 @@ def document(rows: Sequence[Row]) -> dict[str, Any]:
         "environment": environment().model_dump(mode="json"),
         "cases": cases,
     }
-    named: dict[str, Any] = json.loads(json.dumps(content), parse_constant=lambda name: str(float(name)))
+    named: dict[str, Any] = json.loads(
+        json.dumps(content), parse_constant=lambda name: str(float(name))
+    )
     return named
 
 
 @styled
 def picture(rows: Sequence[Row]) -> bytes:
-    """PNG: a line for each family, and on it error / bound of each of its cases; flagged ones, which have none, stand
-    at 0, at the left."""
+    """PNG: a line for each family, and on it error / bound of each of its cases; flagged ones,
+    which have none, stand at 0, at the left."""
     families = list(dict.fromkeys((row.case.group, row.case.family) for row in rows))
     drawn = figure(8, 0.19 * len(families) + 1)
     axes = drawn.subplots()
@@ -280,9 +319,21 @@ def picture(rows: Sequence[Row]) -> bytes:
         ratios = [np.clip(row.outcome.ratio or 0, _SMALLEST_RATIO, 1e3) for row in part]
         places = [families.index((row.case.group, row.case.family)) for row in part]
         marker = "x" if verdict == "flagged" else "o"
-        axes.plot(ratios, places, marker, color=colour, alpha=0.6, ms=5, mew=1, label=f"{verdict}: {len(part)}")
+        axes.plot(
+            ratios,
+            places,
+            marker,
+            color=colour,
+            alpha=0.6,
+            ms=5,
+            mew=1,
+            label=f"{verdict}: {len(part)}",
+        )
     axes.axvline(1, color=VERDICTS["FAIL"], lw=1)
-    axes.set(xscale="log", xlabel="error / bound; smaller ones, 0, and what was refused stand at the left edge")
+    axes.set(
+        xscale="log",
+        xlabel="error / bound; smaller ones, 0, and what was refused stand at the left edge",
+    )
     axes.set_yticks(range(len(families)), map(": ".join, families))
     axes.margins(y=0.01)
     axes.invert_yaxis()
@@ -292,7 +343,8 @@ def picture(rows: Sequence[Row]) -> bytes:
 
 
 def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Write the data and the picture into ``folder``, which is made; their paths. Raises `SubmissionError`."""
+    """Write the data and the picture into ``folder``, which is made; their paths. Raises
+    `SubmissionError`."""
     data, image = folder / "stability.json", folder / "stability.png"
     write_file(picture(rows), image, new_folder=True)
     write_json(document(rows), data)

@@ -1,6 +1,7 @@
-"""Frames whose phase, fringe order and depth are known, and what disturbs them: dim, clipped, non-linear, coarse, few
-or dead frames; fringe order on code edges, at phases of +-pi exactly, and with flipped bits; crossed fringes that are
-dim, clipped, or whose second direction is lost, and rivals on the truth."""
+"""Frames whose phase, fringe order and depth are known, and what disturbs them: dim, clipped,
+non-linear, coarse, few or dead frames; fringe order on code edges, at phases of +-pi exactly, and
+with flipped bits; crossed fringes that are dim, clipped, or whose second direction is lost, and
+rivals on the truth."""
 
 import math
 from collections.abc import Callable
@@ -43,7 +44,9 @@ def phases(count: int = 720) -> Floats:
     return -np.pi + 2 * np.pi * (np.arange(count)[None] + 0.3819) / count
 
 
-def sinusoids(phase: NDArray, shifts: int | NDArray, mean: float = MEAN, modulation: float = MODULATION) -> NDArray:
+def sinusoids(
+    phase: NDArray, shifts: int | NDArray, mean: float = MEAN, modulation: float = MODULATION
+) -> NDArray:
     """Frames A + B cos(phi + delta_n), (N, ...), of these shifts or a number of equal ones."""
     deltas = 2 * np.pi * np.arange(shifts) / shifts if isinstance(shifts, int) else shifts
     return mean + modulation * np.cos(np.add.outer(deltas, phase))
@@ -62,17 +65,24 @@ def phase_error(frames: NDArray) -> Floats:
 def rounding(steps: int = 18) -> float:
     """Largest change of (C, S) by rounding frames to whole grey levels: g / 2, g = max over phi of (2/N) sum
     |sin(phi + delta_n)|, which is 2/N times 2 / sin(pi/N) for even N and 1 / sin(pi/2N) for odd N, about 4/pi."""
-    return 1 / steps * (2 / math.sin(math.pi / steps) if steps % 2 == 0 else 1 / math.sin(math.pi / (2 * steps)))
+    return (
+        1
+        / steps
+        * (2 / math.sin(math.pi / steps) if steps % 2 == 0 else 1 / math.sin(math.pi / (2 * steps)))
+    )
 
 
 def worst_angle(shift: float, modulation: float = MODULATION) -> float:
-    """Largest change of phase, rad, that moving (C, S) by ``shift`` can cause: asin(shift / B), or pi."""
+    """Largest change of phase, rad, that moving (C, S) by ``shift`` can cause: asin(shift / B), or
+    pi."""
     return math.asin(shift / modulation) if shift < modulation else math.pi
 
 
-def bent(response: Callable[[NDArray], NDArray], mean: float, modulation: float, steps: int) -> tuple[float, float]:
-    """Sum of the harmonics kN +- 1, which N steps alias with the fringe, of a sinusoid through a camera's response, and
-    its first harmonic."""
+def bent(
+    response: Callable[[NDArray], NDArray], mean: float, modulation: float, steps: int
+) -> tuple[float, float]:
+    """Sum of the harmonics kN +- 1, which N steps alias with the fringe, of a sinusoid through a
+    camera's response, and its first harmonic."""
     turn = 2 * np.pi * np.arange(1 << 14) / (1 << 14)
     harmonics = np.abs(np.fft.rfft(response(mean + modulation * np.cos(turn)))) * 2 / turn.size
     order = np.arange(harmonics.size)
@@ -81,10 +91,13 @@ def bent(response: Callable[[NDArray], NDArray], mean: float, modulation: float,
 
 
 def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32) -> Rig:
-    """The paper's rig with another pitch and number of steps, and as many Gray bits as these need."""
+    """The paper's rig with another pitch and number of steps, and as many Gray bits as these
+    need."""
     rig = paper_rig(size)
     device = rig.projector
-    sequence = Sequence(steps, *(bits_needed(side, pitch_px) for side in (device.height, device.width)))
+    sequence = Sequence(
+        steps, *(bits_needed(side, pitch_px) for side in (device.height, device.width))
+    )
     return Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
@@ -95,9 +108,12 @@ def direction_levels(
     mean: float = MEAN,
     modulation: float = MODULATION,
 ) -> Floats:
-    """Grey levels of one direction's sinusoids, then Gray bits, at projector coordinates (n,); float64 (N + bits, n).
-    A pixel sees one projector pixel's Gray code, the one its coordinate rounds to."""
-    waves = sinusoids(2 * np.pi * coordinate_px / rig.pitch(direction), rig.sequence.steps, mean, modulation)
+    """Grey levels of one direction's sinusoids, then Gray bits, at projector coordinates (n,);
+    float64 (N + bits, n). A pixel sees one projector pixel's Gray code, the one its coordinate
+    rounds to."""
+    waves = sinusoids(
+        2 * np.pi * coordinate_px / rig.pitch(direction), rig.sequence.steps, mean, modulation
+    )
     length = rig.pattern_length(direction)
     seen = np.clip(np.rint(coordinate_px), 0, length - 1).astype(int)
     bits = rig.code(direction).profiles(length)[len(waves) :, seen]
@@ -107,12 +123,15 @@ def direction_levels(
 def plane_stack(
     rig: Rig, mean: float = MEAN, modulation: float = MODULATION
 ) -> tuple[list[NDArray[np.uint8] | None], NDArray]:
-    """All frames of a plane square to the axis, and the pixels more than 3 px inside the projector's image, (H, W)."""
+    """All frames of a plane square to the axis, and the pixels more than 3 px inside the
+    projector's image, (H, W)."""
     rays = rig.camera.rays()
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
     inside = np.ones(rays[0].shape, bool)
     for direction, px in zip(AXES, projected(rays, PLANE_M, rig), strict=True):
-        levels = grey(direction_levels(rig, px.ravel(), direction, mean, modulation)).reshape(-1, *px.shape)
+        levels = grey(direction_levels(rig, px.ravel(), direction, mean, modulation)).reshape(
+            -1, *px.shape
+        )
         for index, level in zip(rig.sequence.coded(direction), levels, strict=True):
             frames[index] = level
         inside &= (px > 3) & (px < rig.pattern_length(direction) - 4)
@@ -120,19 +139,21 @@ def plane_stack(
 
 
 def coordinate_error(rig: Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, NDArray]:
-    """Error in px of the vertical coordinate, decoded with the default limits, and the flagged pixels."""
+    """Error in px of the vertical coordinate, decoded with the default limits, and the flagged
+    pixels."""
     decoded = plan_direction(rig, "vertical", rig.sequence.steps).decode(grey(levels), Limits())
     return decoded.coordinate_px - exact_px, decoded.reason != Reason.DECODED
 
 
 def rounding_px(rig: Rig) -> float:
-    """Largest error of a coordinate in px by rounding frames to whole grey levels; a slip would be a whole period."""
+    """Largest error of a coordinate in px by rounding frames to whole grey levels; a slip would be
+    a whole period."""
     return rig.pitch("vertical") / (2 * np.pi) * worst_angle(rounding())
 
 
 def _decoded_phase(mean: float, modulation: float) -> tuple[Floats, NDArray]:
-    """Error of the absolute phase in rad, which includes slipped periods, of 20,000 pixels across the pattern; the
-    flagged pixels."""
+    """Error of the absolute phase in rad, which includes slipped periods, of 20,000 pixels across
+    the pattern; the flagged pixels."""
     rig, positions_px = coded_rig(), np.linspace(2.0, 909.0, 20_000)
     levels = direction_levels(rig, positions_px, mean=mean, modulation=modulation)
     error_px, flagged = coordinate_error(rig, levels, positions_px)
@@ -140,7 +161,8 @@ def _decoded_phase(mean: float, modulation: float) -> tuple[Floats, NDArray]:
 
 
 def _least_squares(frames: NDArray, deltas: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Phase of float64 frames (N, 1, n) at shifts ``deltas`` by least squares in 50 digits, (n,)."""
+    """Phase of float64 frames (N, 1, n) at shifts ``deltas`` by least squares in 50 digits,
+    (n,)."""
     mp = high_precision()
     model = mp.matrix([[1, mp.cos(delta), mp.sin(delta)] for delta in deltas])
     solve = (model.T * model) ** -1 * model.T
@@ -153,12 +175,18 @@ def _least_squares(frames: NDArray, deltas: NDArray[np.object_]) -> NDArray[np.o
     "modulation, real frames",
     "rad",
     against="least squares of the same frames in 50 digits",
-    bound="sqrt(2) 2 (N + 4 pi + 2) u (A + B) / B: N + 1 roundings a sum, 4 pi + 1 in each weight, over B",
+    bound=(
+        "sqrt(2) 2 (N + 4 pi + 2) u (A + B) / B: N + 1 roundings a sum, 4 pi + 1 in each weight, "
+        "over B"
+    ),
     modulation=MODULATIONS,
 )
 def modulation_exact(modulation: float) -> Outcome:
     """wrapped phase of 18 float64 frames"""
-    condition, frames = (MEAN + modulation) / modulation, sinusoids(phases(48), 18, MEAN, modulation)
+    condition, frames = (
+        (MEAN + modulation) / modulation,
+        sinusoids(phases(48), 18, MEAN, modulation),
+    )
     exact = _least_squares(frames, 2 * high_precision().pi * wide(range(18)) / 18)
     bound = math.sqrt(2) * 2 * (18 + 4 * math.pi + 2) * U64 * condition + 2 * math.pi * U64
     return worst(difference(wrapped_phase(frames).phase[0], exact), bound, condition=condition)
@@ -169,10 +197,17 @@ def modulation_exact(modulation: float) -> Outcome:
     "modulation, 8-bit frames",
     "rad",
     against="the phase that the frames were made from",
-    bound="asin(g / 2B), g = max (2/N) sum |sin|: half a grey level in every frame; under 5 levels refused",
+    bound=(
+        "asin(g / 2B), g = max (2/N) sum |sin|: half a grey level in every frame; under 5 levels "
+        "refused"
+    ),
     modulation=MODULATIONS,
     expects=lambda modulation: (
-        "either" if modulation == MIN_MODULATION else "number" if modulation > MIN_MODULATION else "refusal"
+        "either"
+        if modulation == MIN_MODULATION
+        else "number"
+        if modulation > MIN_MODULATION
+        else "refusal"
     ),
 )
 def modulation_8bit(modulation: float) -> Outcome:
@@ -188,7 +223,16 @@ def modulation_8bit(modulation: float) -> Outcome:
     against="the phase that the frames were made from",
     bound="asin(sum of the harmonics kN +- 1 over the first), plus half a grey level; more than 2 clipped "
     "frames of 18 must be refused",
-    share=(0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6),  # clipped are floor(18 share) frames, or one more
+    share=(
+        0.0,
+        0.05,
+        0.1,
+        0.2,
+        0.3,
+        0.4,
+        0.5,
+        0.6,
+    ),  # clipped are floor(18 share) frames, or one more
     expects=lambda share: ("number", "number", "either", "refusal")[min(int(18 * share), 3)],
 )
 def saturation(share: float) -> Outcome:
@@ -223,7 +267,10 @@ def gamma_bend(gamma: float, steps: int) -> Outcome:
     "quantisation",
     "rad",
     against="the phase that the frames were made from",
-    bound="asin(q g / 2B), q = 255 / (2^bits - 1), g = max (2/N) sum |sin|; pi / N where one bit leaves 2N states or N",
+    bound=(
+        "asin(q g / 2B), q = 255 / (2^bits - 1), g = max (2/N) sum |sin|; pi / N where one bit "
+        "leaves 2N states or N"
+    ),
     steps=(3, 4, 5, 7, 12, 18),
     bits=(1, 2, 4, 8, 16),
 )
@@ -232,7 +279,9 @@ def quantisation(bits: int, steps: int) -> Outcome:
     levels = 2**bits - 1
     frames = np.rint(sinusoids(phases(), steps) / 255.0 * levels) * (255.0 / levels)
     limit = math.pi / steps if bits == 1 else math.pi
-    return worst(phase_error(frames), min(worst_angle(255.0 / levels * rounding(steps)), limit) + 100 * U64)
+    return worst(
+        phase_error(frames), min(worst_angle(255.0 / levels * rounding(steps)), limit) + 100 * U64
+    )
 
 
 @family(
@@ -240,7 +289,10 @@ def quantisation(bits: int, steps: int) -> Outcome:
     "steps close together",
     "rad",
     against="least squares of the same frames in 50 digits",
-    bound="8 N u cond (A + B) / B (pinv M = I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 refused",
+    bound=(
+        "8 N u cond (A + B) / B (pinv M = I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 "
+        "refused"
+    ),
     expects=lambda spread_rad: "number" if spread_rad > 5e-3 else "either",
     spread_rad=(1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-8),
 )
@@ -251,7 +303,10 @@ def close_steps(spread_rad: float) -> Outcome:
     model = np.stack([np.ones(3), np.cos(deltas), np.sin(deltas)], axis=1)
     largest, _, least = map(float, np.linalg.svd(model, compute_uv=False))
     strength = float(np.linalg.norm(frames[:, 0], axis=0).max())
-    bound = 8 * 3 * U64 * (largest / least) * (MEAN + 100.0) / 100.0 + 3 * U64 * strength / least / 100.0
+    bound = (
+        8 * 3 * U64 * (largest / least) * (MEAN + 100.0) / 100.0
+        + 3 * U64 * strength / least / 100.0
+    )
     error = difference(wrapped_phase(frames, deltas).phase[0], _least_squares(frames, wide(deltas)))
     return worst(error, bound, condition=largest / least)
 
@@ -261,7 +316,9 @@ def close_steps(spread_rad: float) -> Outcome:
     "dead frame",
     "mm",
     against="the frame's mean contradicts the N - 1 others",
-    bound="frame means follow A + C cos + S sin too; from 4 steps on the dead frame must be refused",
+    bound=(
+        "frame means follow A + C cos + S sin too; from 4 steps on the dead frame must be refused"
+    ),
     expects="refusal",
     steps=(18, 9, 6, 4),
     level=(0, 255),
@@ -287,10 +344,12 @@ def dead_frame(steps: int, level: int) -> Outcome:
     pitch_px=(2.5, 3.9, 4.0, 5.3, 18.0, 36.7, 100.0, 912.0, 1000.0),
 )
 def pitch(pitch_px: float, bit_noise: float) -> Outcome:
-    """projector coordinate by the decoder, 8-bit frames with noise in the Gray bits, over the whole pattern and in the
-    middle of every period"""
+    """projector coordinate by the decoder, 8-bit frames with noise in the Gray bits, over the whole
+    pattern and in the middle of every period"""
     rig = coded_rig(pitch_px)
-    middles = (np.arange(int(912 / pitch_px)) + 0.5) * pitch_px  # phases of +-pi: the sign of the sine is arbitrary
+    middles = (
+        np.arange(int(912 / pitch_px)) + 0.5
+    ) * pitch_px  # phases of +-pi: the sign of the sine is arbitrary
     positions_px = np.concatenate([np.linspace(2.0, 909.0, 20_000), middles])
     levels = direction_levels(rig, positions_px)
     bits = levels[rig.sequence.steps :]
@@ -347,7 +406,10 @@ def arctangent(scale: float) -> Outcome:
     "flipped bit, both directions",
     "mm",
     against="the plane, 1800 mm",
-    bound="8-bit frames, by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar line",
+    bound=(
+        "8-bit frames, by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar "
+        "line"
+    ),
     expects="either",
     direction=AXES,
     bit=range(7),
@@ -373,10 +435,13 @@ MIDDLE = slice(120, 200), slice(120, 200)
 
 
 def plane_outcome(
-    family: Crossed, white: float = 160.0, rig: Rig = CROSSED_RIG, measured_as: Crossed | None = None
+    family: Crossed,
+    white: float = 160.0,
+    rig: Rig = CROSSED_RIG,
+    measured_as: Crossed | None = None,
 ) -> Outcome:
-    """The worst pixel of a plane that ``family`` lights, flagged where the route gives a reason or no depth.
-    ``measured_as``: the family that the route takes it for."""
+    """The worst pixel of a plane that ``family`` lights, flagged where the route gives a reason or
+    no depth. ``measured_as``: the family that the route takes it for."""
     u, v = projected(rig.camera.rays(), DEPTH_M, rig)
     pairs = zip(family.weights, family.cycles_per_px, strict=True)
     waves = sum(weight * np.cos(2 * np.pi * (a * u + b * v)) for weight, (a, b) in pairs)
@@ -397,7 +462,10 @@ def plane_outcome(
     "dim or saturated",
     "mm",
     against="the plane's depth, closed form",
-    bound="pi / 2 of the joint phase: a rival order is further off, and a pixel that may be one must say so",
+    bound=(
+        "pi / 2 of the joint phase: a rival order is further off, and a pixel that may be one must "
+        "say so"
+    ),
     expects=lambda white: "number" if 40 <= white <= 220 else "either",
     white=(2000.0, 600.0, 400.0, 300.0, 260.0, 220.0, 160.0, 80.0, 40.0, 20.0, 10.0, 5.0, 2.0, 0.0),
 )
@@ -416,7 +484,8 @@ def exposed(white: float) -> Outcome:
     weight=(0.5, 0.3, 0.1, 0.05, 0.02, 1e-9),
 )
 def lost(weight: float) -> Outcome:
-    """depth of a plane whose second carrier has this weight, and not the 0.5 that the route knows of"""
+    """depth of a plane whose second carrier has this weight, and not the 0.5 that the route knows
+    of"""
     return plane_outcome(replace(CARRIERS, weights=(0.5, weight)), measured_as=CARRIERS)
 
 
@@ -430,8 +499,8 @@ def lost(weight: float) -> Outcome:
     ratio=(0.5, 1 / 3, 0.25, 0.2),
 )
 def rival(ratio: float) -> Outcome:
-    """depth of a plane by periods of 12 px whose gains have this ratio, over four and more periods: with 1 / 2 and 1 /
-    3 another order fits exactly"""
+    """depth of a plane by periods of 12 px whose gains have this ratio, over four and more periods:
+    with 1 / 2 and 1 / 3 another order fits exactly"""
     turn_deg = math.degrees(math.atan(ratio))
     along_deg = 128.66  # of the paper's epipolar lines
     return plane_outcome(Crossed((12.0, 12.0), (along_deg + turn_deg, along_deg - 90 + turn_deg)))
@@ -447,7 +516,7 @@ def rival(ratio: float) -> Outcome:
     angle_deg=(0.0, 20.0, 45.0),
 )
 def along_one_axis(angle_deg: float) -> Outcome:
-    """depth of a plane where the projector is above the camera and the carriers are turned by this angle: at 0 the
-    second carrier tells no depth"""
+    """depth of a plane where the projector is above the camera and the carriers are turned by this
+    angle: at 0 the second carrier tells no depth"""
     rig = replace(CROSSED_RIG, translation_m=(0.0, -0.16, 0.0))
     return plane_outcome(Crossed((18.0, 18.0), (angle_deg, angle_deg + 90)), rig=rig)

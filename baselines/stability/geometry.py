@@ -1,6 +1,7 @@
-"""Triangulation with baselines down to 0.01 mm, ranges to 100 m, parallel rays and single precision; rigs with nearly
-singular intrinsics, rotations off orthonormal and lenses that fold; scenes with walls edge-on, needles, one to ten
-million triangles, and the camera inside the object."""
+"""Triangulation with baselines down to 0.01 mm, ranges to 100 m, parallel rays and single
+precision; rigs with nearly singular intrinsics, rotations off orthonormal and lenses that fold;
+scenes with walls edge-on, needles, one to ten million triangles, and the camera inside the
+object."""
 
 import math
 from dataclasses import replace
@@ -22,14 +23,24 @@ from fpp_ml_bench.baselines.stability.cases import (
     wrong,
 )
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, depth_noise_mm
+from fpp_ml_bench.decoding.triangulation import (
+    depth_from_both,
+    depth_from_coordinate,
+    depth_noise_mm,
+)
 from fpp_ml_bench.loaders.render.illumination import light_surface, projector_centre_m
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.pinhole import Maps, Pinhole, distortion_polynomial, fold_radius_squared, undistort
+from fpp_ml_bench.optics.pinhole import (
+    Maps,
+    Pinhole,
+    distortion_polynomial,
+    fold_radius_squared,
+    undistort,
+)
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 from fpp_ml_bench.optics.sequence import AXES, Direction
 
@@ -43,24 +54,28 @@ AHEAD = np.stack([*RAYS, np.ones(40)])
 
 
 def scaled_baseline(baseline_mm: float, ahead: float = 0.0) -> Rig:
-    """The paper's rig with a shorter baseline and the projector ``ahead`` of the camera by that share of it, and then
-    turned."""
+    """The paper's rig with a shorter baseline and the projector ``ahead`` of the camera by that
+    share of it, and then turned."""
     t = np.array([*PAPER.translation_m[:2], -ahead * PAPER.baseline_m])
     t *= baseline_mm / MM_PER_M / np.linalg.norm(t)
-    return replace(PAPER, rotation=(TURN if ahead else np.eye(3)).tolist(), translation_m=tuple(t.tolist()))
+    return replace(
+        PAPER, rotation=(TURN if ahead else np.eye(3)).tolist(), translation_m=tuple(t.tolist())
+    )
 
 
 def exact_coordinates(depth_m: float, rig: Rig, rays: NDArray = AHEAD) -> Floats:
-    """Projector px (2, n) of the points at ``depth_m`` on the ``rays`` (3, n), in 50 digits, rounded once."""
+    """Projector px (2, n) of the points at ``depth_m`` on the ``rays`` (3, n), in 50 digits,
+    rounded once."""
     a, b, c = wide(rig.R) @ wide(rays) * depth_m + wide(rig.t)[:, None]
     device = rig.projector
     return np.stack([device.fx * a / c + device.cx, device.fy * b / c + device.cy]).astype(float)
 
 
 def conditioning(coordinate: NDArray, rig: Rig, axis: int = 0) -> tuple[Floats, Floats]:
-    """Bound of the closed form's relative error, and its condition number: sum of magnitudes over |a - x_p a_2|.
-    Running error analysis: x_p has 2 roundings; a, a_2 have 3 each of sums of magnitudes; the difference and the top
-    cancel; 4 more for the last quotient and the change to mm."""
+    """Bound of the closed form's relative error, and its condition number: sum of magnitudes over
+    |a - x_p a_2|. Running error analysis: x_p has 2 roundings; a, a_2 have 3 each of sums of
+    magnitudes; the difference and the top cancel; 4 more for the last quotient and the change to
+    mm."""
     t, terms = rig.t, rig.R[:, :, None] * AHEAD
     ideal = (coordinate - rig.projector.centre[axis]) / rig.projector.focal[axis]
     size, a = np.abs(terms).sum(axis=1), terms.sum(axis=1)
@@ -70,25 +85,37 @@ def conditioning(coordinate: NDArray, rig: Rig, axis: int = 0) -> tuple[Floats, 
 
 
 def exact_depth_mm(coordinate: NDArray, rig: Rig, axis: int = 0) -> NDArray[np.object_]:
-    """Depth of these float64 inputs in 50 digits, by the closed form; infinite where ray and plane are parallel."""
+    """Depth of these float64 inputs in 50 digits, by the closed form; infinite where ray and plane
+    are parallel."""
     a = wide(rig.R) @ wide(AHEAD)
     ideal = (wide(coordinate) - rig.projector.centre[axis]) / rig.projector.focal[axis]
     bottom = a[axis] - ideal * a[2]
     parallel = bottom == 0
-    return np.where(parallel, math.inf, 1000 * (ideal * rig.t[2] - rig.t[axis]) / (bottom + parallel))
+    return np.where(
+        parallel, math.inf, 1000 * (ideal * rig.t[2] - rig.t[axis]) / (bottom + parallel)
+    )
 
 
 def relative(depth_mm: NDArray, exact: NDArray[np.object_]) -> Floats:
     return difference(depth_mm, exact) / np.abs(exact.astype(float))
 
 
-def closed_form(coordinate: NDArray, rig: Rig, axis: int = 0, indistinct: NDArray | bool = False) -> Outcome:
+def closed_form(
+    coordinate: NDArray, rig: Rig, axis: int = 0, indistinct: NDArray | bool = False
+) -> Outcome:
     """The outcome of depths from one coordinate; the ``indistinct`` ones may be masked."""
-    exact, depth_mm = exact_depth_mm(coordinate, rig, axis), depth_from_coordinate(RAYS, coordinate, rig, AXES[axis])
+    exact, depth_mm = (
+        exact_depth_mm(coordinate, rig, axis),
+        depth_from_coordinate(RAYS, coordinate, rig, AXES[axis]),
+    )
     bound, condition = conditioning(coordinate, rig, axis)
-    # Where the bound exceeds half of the depth, the number is round-off and must be as behind the camera.
+    # Where the bound exceeds half of the depth, the number is round-off and must be as behind the
+    # camera.
     nothing = ~(bound < 0.5) | ~(exact.astype(float) > 0)
-    error, flagged = np.where(nothing, np.inf, relative(depth_mm, exact)), np.isnan(depth_mm) & (nothing | indistinct)
+    error, flagged = (
+        np.where(nothing, np.inf, relative(depth_mm, exact)),
+        np.isnan(depth_mm) & (nothing | indistinct),
+    )
     return worst(error, bound, flagged, condition)
 
 
@@ -97,13 +124,18 @@ def closed_form(coordinate: NDArray, rig: Rig, axis: int = 0, indistinct: NDArra
     "baseline and range",
     "relative",
     against="the closed form on the same float64 inputs in 50 digits",
-    bound="u (8 kappa + 5 kappa_top + 4), kappa = sum of magnitudes over |a - x_p a_2|: running error analysis",
+    bound=(
+        "u (8 kappa + 5 kappa_top + 4), kappa = sum of magnitudes over |a - x_p a_2|: running "
+        "error analysis"
+    ),
     direction=AXES,
     ahead=(0.0, 0.3),
     range_m=(0.3, 1.8, 100.0),
     baseline_mm=BASELINES,
 )
-def one_coordinate(baseline_mm: float, range_m: float, direction: Direction, ahead: float) -> Outcome:
+def one_coordinate(
+    baseline_mm: float, range_m: float, direction: Direction, ahead: float
+) -> Outcome:
     """depth from one coordinate, the projector beside the camera, or ahead of it and turned"""
     rig, axis = scaled_baseline(baseline_mm, ahead), AXES.index(direction)
     return closed_form(exact_coordinates(range_m, rig)[axis], rig, axis)
@@ -114,7 +146,10 @@ def one_coordinate(baseline_mm: float, range_m: float, direction: Direction, ahe
     "both directions",
     "relative",
     against="the point that they were computed from in 50 digits",
-    bound="8 x the larger bound of the closed form: a weighted mean of both, and the coordinates' own rounding",
+    bound=(
+        "8 x the larger bound of the closed form: a weighted mean of both, and the coordinates' "
+        "own rounding"
+    ),
     ahead=(0.0, 0.3, 1.0),
     baseline_mm=BASELINES,
 )
@@ -123,7 +158,9 @@ def both_coordinates(baseline_mm: float, ahead: float) -> Outcome:
     rig = scaled_baseline(baseline_mm, ahead)
     u, v = coordinates = exact_coordinates(1.8, rig)
     depth_mm = depth_from_both(RAYS, u, v, rig, 0.7, 1.3).depth_mm
-    bounds, conditions = zip(*(conditioning(px, rig, axis) for axis, px in enumerate(coordinates)), strict=True)
+    bounds, conditions = zip(
+        *(conditioning(px, rig, axis) for axis, px in enumerate(coordinates)), strict=True
+    )
     return worst(depth_mm / 1800.0 - 1, 8 * np.maximum(*bounds), condition=conditions)
 
 
@@ -132,7 +169,10 @@ def both_coordinates(baseline_mm: float, ahead: float) -> Outcome:
     "nearly parallel rays",
     "relative",
     against="the closed form on the same float64 inputs in 50 digits",
-    bound="u (8 kappa + 5 kappa_top + 4), running error analysis; masked where it lies behind or at infinity",
+    bound=(
+        "u (8 kappa + 5 kappa_top + 4), running error analysis; masked where it lies behind or at "
+        "infinity"
+    ),
     expects="either",
     shift_px=(10.0, 1.0, 1e-3, 1e-6, 1e-9, 1e-11, 1e-12, 0.0, -1e-6, -1.0),
 )
@@ -177,7 +217,11 @@ def noise_law(baseline_mm: float, direction: Direction) -> Outcome:
 def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
     """depth from a coordinate rounded to float32"""
     rig = scaled_baseline(baseline_mm)
-    coordinate, focal, centre = exact_coordinates(range_m, rig)[0], rig.projector.fx, rig.projector.cx
+    coordinate, focal, centre = (
+        exact_coordinates(range_m, rig)[0],
+        rig.projector.fx,
+        rig.projector.cx,
+    )
     depth_mm = depth_from_coordinate(RAYS, coordinate.astype(np.float32), rig, "vertical")
     condition = np.abs(coordinate) / np.abs(coordinate - centre - focal * RAYS[0])
     bound = 1.001 * U32 * condition / (1 - U32 * condition)
@@ -197,7 +241,12 @@ def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
 def overflowing(value: float) -> Outcome:
     """depth from coordinates that no projector has"""
     u = np.full(40, value)
-    depths = np.stack([depth_from_coordinate(RAYS, u, PAPER, "vertical"), depth_from_both(RAYS, u, u, PAPER).depth_mm])
+    depths = np.stack(
+        [
+            depth_from_coordinate(RAYS, u, PAPER, "vertical"),
+            depth_from_both(RAYS, u, u, PAPER).depth_mm,
+        ]
+    )
     return worst(np.where(np.isfinite(depths) & (depths > 0), 0.0, np.inf), 0.0, np.isnan(depths))
 
 
@@ -206,7 +255,10 @@ def overflowing(value: float) -> Outcome:
     "intrinsic matrix",
     "px",
     against="the pixel",
-    bound="3 u (|u - c| + |c|) + u |u|; refused from a condition number of 2^26 on, half of the digits",
+    bound=(
+        "3 u (|u - c| + |c|) + u |u|; refused from a condition number of 2^26 on, half of the "
+        "digits"
+    ),
     expects=lambda focal_px, centre_px: (
         "number" if max(2 * centre_px**2 / focal_px, focal_px) / 960 < 2.0**24 else "either"
     ),
@@ -215,7 +267,10 @@ def overflowing(value: float) -> Outcome:
 )
 def intrinsics(focal_px: float, centre_px: float) -> Outcome:
     """pixel to ray and back"""
-    camera, u = Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px), np.linspace(-0.5, 959.5, 97)
+    camera, u = (
+        Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px),
+        np.linspace(-0.5, 959.5, 97),
+    )
     if not np.isfinite(camera.rays()).all():
         return wrong("rays that are not finite")
     size = np.abs(u - centre_px) + abs(centre_px)
@@ -241,7 +296,8 @@ def off_orthonormal(off: float, kind: str) -> Outcome:
     coordinate = exact_coordinates(1.8, base)[0]
     depth_mm = depth_from_coordinate(RAYS, coordinate, rig, "vertical")
     rounding, condition = conditioning(coordinate, base)
-    # Each row of R moves by off at most: the difference a - x_p a_2 by off times the condition number, twice.
+    # Each row of R moves by off at most: the difference a - x_p a_2 by off times the condition
+    # number, twice.
     bound = rounding + 2 * off * condition
     return worst(depth_mm / 1800.0 - 1, bound / (1 - bound), condition=condition)
 
@@ -272,7 +328,10 @@ def rotation_vector(angle_rad: float) -> Outcome:
     "tangential lens inverse",
     "1",
     against="the ideal points, where the model is one to one from the axis on",
-    bound="32 u / least slope of the model, a residual of some roundings; no ideal point for twice the largest image",
+    bound=(
+        "32 u / least slope of the model, a residual of some roundings; no ideal point for twice "
+        "the largest image"
+    ),
     k1=(-0.2,),
     k2=(0.0,),
     k3=(0.0,),
@@ -283,7 +342,10 @@ def rotation_vector(angle_rad: float) -> Outcome:
     "lens inverse",
     "1",
     against="the ideal points, where the model is one to one from the axis on",
-    bound="32 u / least slope of the model, a residual of some roundings; no ideal point for twice the largest image",
+    bound=(
+        "32 u / least slope of the model, a residual of some roundings; no ideal point for twice "
+        "the largest image"
+    ),
     k1=(-0.1, -0.8, -5.0, 0.6, 100.0),
     k2=(0.0, 0.9, -1.5),
     k3=(0.0, -0.3),
@@ -318,8 +380,8 @@ DISTANCE_M = 1.8
 
 
 def seen(vertices_m: ArrayLike, faces: ArrayLike = ((0, 1, 2), (0, 2, 3))) -> tuple[Floats, Floats]:
-    """What the camera sees of a mesh, of a quadrilateral without ``faces``: the rays that hit, (n, 3), at z = 1, and
-    their depth in m, (n,)."""
+    """What the camera sees of a mesh, of a quadrilateral without ``faces``: the rays that hit, (n,
+    3), at z = 1, and their depth in m, (n,)."""
     vertices = np.asarray(vertices_m, dtype=np.float64)
     mesh = SolidMesh("mesh", vertices, np.asarray(faces, dtype=np.int32))
     hits = TracedObject(mesh, vertices).primary(PixelRays.of(SCENE_RIG.camera))
@@ -354,8 +416,8 @@ def edge_on(off_deg: float) -> Outcome:
     facing = terms.sum(axis=1)
     exact = np.clip(normal @ exact_corners[0] / facing, low, high)
     condition = (np.abs(terms).sum(axis=1) / np.abs(facing)).astype(float)
-    # Rounding of normal (12), plane (6) and products (4), times the condition; clipped to the wall's own extent, which
-    # also bounds the error of a ray on the wrong side of an edge.
+    # Rounding of normal (12), plane (6) and products (4), times the condition; clipped to the
+    # wall's own extent, which also bounds the error of a ray on the wrong side of an edge.
     bound = np.minimum(22 * U64 * condition * 1.9 * 12, float(high - low))
     return worst(np.asarray(depth_m - exact, float), bound, condition=condition)
 
@@ -372,12 +434,18 @@ def edge_on(off_deg: float) -> Outcome:
 def needle(width_px: float, centre_px: float) -> Outcome:
     """pixel columns of an upright strip, and its depth"""
     camera, column = SCENE_RIG.camera, 90.0 + centre_px
-    left, right = ((column + side * width_px / 2 - camera.cx) / camera.fx * DISTANCE_M for side in (-1, 1))
-    rays, depth_m = seen([[x, y, DISTANCE_M] for x, y in ((left, -1), (right, -1), (right, 1), (left, 1))])
+    left, right = (
+        (column + side * width_px / 2 - camera.cx) / camera.fx * DISTANCE_M for side in (-1, 1)
+    )
+    rays, depth_m = seen(
+        [[x, y, DISTANCE_M] for x, y in ((left, -1), (right, -1), (right, 1), (left, 1))]
+    )
     count = (np.abs(np.arange(camera.width) - column) < width_px / 2).sum() * camera.height
     off_px = np.abs(rays[:, 0] * camera.fx + camera.cx - column)
     outside = (off_px > width_px / 2).sum() + abs(count - depth_m.size)
-    return worst(np.append(depth_m - DISTANCE_M, outside), np.append(0 * depth_m + 64 * U64 * DISTANCE_M, 0))
+    return worst(
+        np.append(depth_m - DISTANCE_M, outside), np.append(0 * depth_m + 64 * U64 * DISTANCE_M, 0)
+    )
 
 
 @family(
@@ -395,7 +463,9 @@ def triangles(count: float) -> Outcome:
     y, x = np.meshgrid(*[np.linspace(-0.3, 0.3, side + 1)] * 2)
     number = np.arange((side + 1) ** 2, dtype=np.int32).reshape(x.shape)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-    faces = np.concatenate([np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))])
+    faces = np.concatenate(
+        [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
+    )
     rays, depth_m = seen(np.stack([x, y, 1.7 + x**2 + y**2], axis=-1).reshape(-1, 3), faces)
     # Z = 1.7 + Z^2 (x^2 + y^2), the nearer root, without cancellation.
     exact = 2 * 1.7 / (1 + np.sqrt(1 - 4 * 1.7 * (rays[:, :2] ** 2).sum(axis=1)))
@@ -434,8 +504,15 @@ def camera_inside(turn_deg: float) -> Outcome:
 )
 def light_at_projector(distance_m: float) -> Outcome:
     """light on a point so far ahead of the projector's centre"""
-    light, point = named_light("paper"), np.add(projector_centre_m(SCENE_RIG), [[0.0, 0.0, distance_m]])
+    light, point = (
+        named_light("paper"),
+        np.add(projector_centre_m(SCENE_RIG), [[0.0, 0.0, distance_m]]),
+    )
     gain = light_surface(
-        point, np.array([[0.0, 0.0, -1.0]]), SCENE_RIG, light, PatternLight.of(SCENE_RIG, light.projector)
+        point,
+        np.array([[0.0, 0.0, -1.0]]),
+        SCENE_RIG,
+        light,
+        PatternLight.of(SCENE_RIG, light.projector),
     ).gain
     return worst(np.where(np.isfinite(gain) & (gain >= 0), 0.0, math.inf))

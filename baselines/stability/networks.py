@@ -1,5 +1,5 @@
-"""Losses of zero residual, empty mask, half precisions and any magnitude; instance normalisation of nearly constant
-input; networks in single and half precision; the training metric."""
+"""Losses of zero residual, empty mask, half precisions and any magnitude; instance normalisation of
+nearly constant input; networks in single and half precision; the training metric."""
 
 import math
 from collections.abc import Callable
@@ -9,7 +9,12 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision, torch_threads
+from fpp_ml_bench.baselines.networks.base import (
+    RECENTRED_FROM,
+    InstanceNorm,
+    in_full_precision,
+    torch_threads,
+)
 from fpp_ml_bench.baselines.networks.model import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks.model import build
 from fpp_ml_bench.baselines.stability.cases import U32, Outcome, family, gamma, worst, wrong
@@ -26,13 +31,17 @@ SMALL = {
     "pix2pix": {"width": 4},
     "pix2pix_unet": {"width": 4, "levels": 3},
 }
-"""Widths of the networks here: small, with the paper's layers. For images of 64 px one thread is faster."""
+"""Widths of the networks here: small, with the paper's layers. For images of 64 px one thread is
+faster."""
 _SHAPE = (2, 1, 24, 32)
 _IMAGE = (1, 1, 64, 64)
 
 
 def random(
-    shape: tuple[int, ...], seed: int, draw: Callable[..., Tensor] = torch.randn, dtype: torch.dtype = torch.float64
+    shape: tuple[int, ...],
+    seed: int,
+    draw: Callable[..., Tensor] = torch.randn,
+    dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     """Seeded random numbers, normal ones or by ``torch.rand`` uniform in [0, 1)."""
     return draw(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
@@ -84,7 +93,9 @@ def loss(name: str, kind: str, scale: float) -> Outcome:
     """loss of errors of this size and its gradient, which is 0 for a residual of 0"""
     dtype = getattr(torch, kind, torch.float32)
     target = (scale * _target()).to(dtype)
-    prediction = target if kind == "zero residual" else target + (0.1 * scale * random(_SHAPE, 2)).to(dtype)
+    prediction = (
+        target if kind == "zero residual" else target + (0.1 * scale * random(_SHAPE, 2)).to(dtype)
+    )
     target = 0 * target if kind == "empty mask" else target
     prediction = prediction.clone().requires_grad_()
     value = _loss(name)(prediction, target)
@@ -94,7 +105,10 @@ def loss(name: str, kind: str, scale: float) -> Outcome:
     slope = float(gradient.abs().max()) * (kind == "zero residual")  # NaN stays NaN
     # torch sums in vectors and pairs, log2(n) + 16 roundings, doubled by the square
     exact = _exact_loss(name, prediction.detach(), target)
-    return worst([value.item() - exact, slope], [gamma(2 * (math.log2(target.numel()) + 16), U32) * exact, 0.0])
+    return worst(
+        [value.item() - exact, slope],
+        [gamma(2 * (math.log2(target.numel()) + 16), U32) * exact, 0.0],
+    )
 
 
 @family(
@@ -108,8 +122,11 @@ def loss(name: str, kind: str, scale: float) -> Outcome:
     offset=(0.0, 1.0, 1e2, 1e4, 1e6, 1e8),
 )
 def instance_norm(offset: float, amplitude: float) -> Outcome:
-    """normalised map of this amplitude on this offset in float32, and whether its gradient is finite"""
-    x = (amplitude * random((1, 2, 48, 48), 4) + offset).float().requires_grad_()  # one-pass variances cancel here
+    """normalised map of this amplitude on this offset in float32, and whether its gradient is
+    finite"""
+    x = (
+        (amplitude * random((1, 2, 48, 48), 4) + offset).float().requires_grad_()
+    )  # one-pass variances cancel here
     layer = InstanceNorm(2, affine=False)
     output = layer(x)
     (gradient,) = torch.autograd.grad(output, x, random(tuple(x.shape), 3).float())
@@ -127,7 +144,10 @@ def instance_norm(offset: float, amplitude: float) -> Outcome:
     "network in float32",
     "1",
     against="the same weights in float64",
-    bound="16 x what rounding each weight and pixel once (2^-24) does: condition number x unit round-off",
+    bound=(
+        "16 x what rounding each weight and pixel once (2^-24) does: condition number x unit "
+        "round-off"
+    ),
     name=NAMES,
 )
 @torch_threads(1)
@@ -137,12 +157,19 @@ def network_single(name: str) -> Outcome:
     network, x = small_network(name), random(_IMAGE, 11, torch.rand)
     exact, spread = network(x), 0.0
     for seed in (20, 21, 22):
-        draw = partial(torch.rand, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        draw = partial(
+            torch.rand, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+        )
         values = {"": x, **dict(network.named_parameters())}
-        inexact = {key: value * (1 + U32 * (2 * draw(value.shape) - 1)) for key, value in values.items()}
-        spread = max(spread, float((functional_call(network, inexact, inexact.pop("")) - exact).abs().max()))
+        inexact = {
+            key: value * (1 + U32 * (2 * draw(value.shape) - 1)) for key, value in values.items()
+        }
+        spread = max(
+            spread, float((functional_call(network, inexact, inexact.pop("")) - exact).abs().max())
+        )
     single = network.float()(x.float()).double()
-    # A weight takes part in sums of up to 10^3 products: 16 is half of sqrt(10^3), and includes the weights' rounding.
+    # A weight takes part in sums of up to 10^3 products: 16 is half of sqrt(10^3), and includes the
+    # weights' rounding.
     condition = spread / U32 / float(exact.abs().max())
     return worst((single - exact).numpy(), 16 * spread, condition=condition)
 
@@ -168,7 +195,9 @@ def network_half(name: str, dtype: str) -> Outcome:
         depth = in_full_precision(head, features)
     if out.dtype != torch.float32 or not torch.isfinite(out).all():
         return wrong(f"the network gives {out.dtype}, or numbers that are not finite")
-    return worst((depth.double() - head.double()(features.double())).numpy(), gamma(10, U32) * 1810.0)
+    return worst(
+        (depth.double() - head.double()(features.double())).numpy(), gamma(10, U32) * 1810.0
+    )
 
 
 @family(
@@ -177,7 +206,13 @@ def network_half(name: str, dtype: str) -> Outcome:
     "relative",
     against="sums in 50 digits",
     bound="gamma of 460 roundings",
-    scale=(1.0, 1e-30, 1e26, 1e-160, 1e-300),  # of depths up to 5096; above 1e30 mm they are refused
+    scale=(
+        1.0,
+        1e-30,
+        1e26,
+        1e-160,
+        1e-300,
+    ),  # of depths up to 5096; above 1e30 mm they are refused
 )
 def metric_scale(scale: float) -> Outcome:
     """mean RMSE of 50 samples as a torchmetrics metric"""

@@ -1,5 +1,5 @@
-"""Normalisation of flat, tiny and extreme depth ranges; metrics of 1e10 pixels, of magnitudes from 1e-30 to 1e30 and
-beyond, of subnormals, and of cancelling errors."""
+"""Normalisation of flat, tiny and extreme depth ranges; metrics of 1e10 pixels, of magnitudes from
+1e-30 to 1e30 and beyond, of subnormals, and of cancelling errors."""
 
 import math
 from collections.abc import Iterable
@@ -21,17 +21,26 @@ from fpp_ml_bench.baselines.stability.cases import (
     wrong,
 )
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
-from fpp_ml_bench.evaluation.score.sample_scores import BLOCK, EMPTY, ErrorStats, combine, mean_of, stats_of
+from fpp_ml_bench.evaluation.score.sample_scores import (
+    BLOCK,
+    EMPTY,
+    ErrorStats,
+    combine,
+    mean_of,
+    stats_of,
+)
 
 RANDOM = 6.0
-"""Roundings of unrelated numbers add up like a random walk: n of them stay within 6 sqrt(n) u but for one case in a
-hundred million (Higham and Mary 2019). Where the numbers are all alike the worst case n u is used."""
+"""Roundings of unrelated numbers add up like a random walk: n of them stay within 6 sqrt(n) u but
+for one case in a hundred million (Higham and Mary 2019). Where the numbers are all alike the worst
+case n u is used."""
 _TINY = 2.0**-149
 _STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
 
 
 def depth_map(low_mm: float, span_mm: float, stored: str) -> NDArray:
-    """A depth map of 24 x 24 px in mm: the object's depths from ``low_mm`` to ``low_mm + span_mm``."""
+    """A depth map of 24 x 24 px in mm: the object's depths from ``low_mm`` to ``low_mm +
+    span_mm``."""
     depth = np.zeros((24, 24))
     depth[3:21, 5:19] = low_mm + span_mm * np.linspace(0, 1, 252).reshape(18, 14)
     return depth.astype(stored)
@@ -113,17 +122,22 @@ def _compared(stats: ErrorStats, exact: tuple[float, float], operations: float) 
 )
 def streamed(pixels: float, scale_mm: float) -> Outcome:
     """MAE and RMSE of merged states of 10^6 px, 20 kinds of block"""
-    # Each kind of block is summed once, for it would give the same state every time, and its state is merged as often
-    # as it comes: what grows with the number of pixels is the merging, all of it done here.
+    # Each kind of block is summed once, for it would give the same state every time, and its state
+    # is merged as often as it comes: what grows with the number of pixels is the merging, all of it
+    # done here.
     rng, blocks = np.random.default_rng(11), round(pixels / _STREAM_BLOCK)
     levels = scale_mm * rng.lognormal(0, 3, 64)
     kinds = [levels[rng.integers(0, 64, _STREAM_BLOCK)] for _ in range(_STREAM_KINDS)]
     states = [stats_of(kind) for kind in kinds]
     total = reduce(combine, (states[number % _STREAM_KINDS] for number in range(blocks)), EMPTY)
-    times = [blocks // _STREAM_KINDS + (kind < blocks % _STREAM_KINDS) for kind in range(_STREAM_KINDS)]
+    times = [
+        blocks // _STREAM_KINDS + (kind < blocks % _STREAM_KINDS) for kind in range(_STREAM_KINDS)
+    ]
     if total.pixels != blocks * _STREAM_BLOCK:
         return wrong(f"{total.pixels} pixels counted, {blocks * _STREAM_BLOCK} streamed")
-    return _compared(total, exact_scores(zip(kinds, times, strict=True)), RANDOM * math.sqrt(BLOCK + 6 * blocks))
+    return _compared(
+        total, exact_scores(zip(kinds, times, strict=True)), RANDOM * math.sqrt(BLOCK + 6 * blocks)
+    )
 
 
 @family(
@@ -140,7 +154,9 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
 def magnitude(scale_mm: float, decades: int) -> Outcome:
     """MAE and RMSE of 20,000 errors up to 999 x scale_mm, over so many powers of ten down"""
     rng = np.random.default_rng(3)
-    errors = scale_mm * rng.integers(-999, 1000, 20_000) / 10.0 ** rng.integers(0, decades + 1, 20_000)
+    errors = (
+        scale_mm * rng.integers(-999, 1000, 20_000) / 10.0 ** rng.integers(0, decades + 1, 20_000)
+    )
     return _compared(stats_of(errors), exact_scores([(errors, 1)]), RANDOM * math.sqrt(BLOCK))
 
 
@@ -156,7 +172,9 @@ def one_large(large_mm: float) -> Outcome:
     """MAE and RMSE of 10^7 errors, all but this one 1 mm"""
     errors = np.ones(10_000_000)  # summed naively in float32 the small ones vanish from 2^24 on
     errors[0] = large_mm
-    return _compared(stats_of(errors), exact_scores([(errors[:1], 1), (errors[1:2], errors.size - 1)]), BLOCK)
+    return _compared(
+        stats_of(errors), exact_scores([(errors[:1], 1), (errors[1:2], errors.size - 1)]), BLOCK
+    )
 
 
 @family(

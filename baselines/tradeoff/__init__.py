@@ -1,1 +1,2 @@
-"""Error against run time and captured frames: measuring every setting, and the picture of error against a cost."""
+"""Error against run time and captured frames: measuring every setting, and the picture of error
+against a cost."""

@@ -1,11 +1,13 @@
-"""Training a network from a fringe image to depth by a recipe (paper Section 5.3), from dataset to weights file.
+"""Training a network from a fringe image to depth by a recipe (paper Section 5.3), from dataset to
+weights file.
 
-The weights kept are those of the lowest validation loss, the mean over samples of each one's own; the scores beside it
-are the evaluator's, under individual normalisation with the sample's range, as on the leaderboard. Beside the engine's
-files a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
+The weights kept are those of the lowest validation loss, the mean over samples of each one's own;
+the scores beside it are the evaluator's, under individual normalisation with the sample's range, as
+on the leaderboard. Beside the engine's files a folder holds ``weights.safetensors`` and, at the
+end, ``done.json``.
 
-The order of an epoch depends on the seed and its number alone, so that a resumed training gives the same result as one
-that never stopped.
+The order of an epoch depends on the seed and its number alone, so that a resumed training gives the
+same result as one that never stopped.
 """
 
 import json
@@ -70,8 +72,8 @@ _RELATIVE = 1e-9
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """Epochs of the training in the folder ``out``, and its files; ``finished`` is False when its minutes ran out: call
-    `train` again to resume."""
+    """Epochs of the training in the folder ``out``, and its files; ``finished`` is False when its
+    minutes ran out: call `train` again to resume."""
 
     out: Path
     epochs: int
@@ -93,12 +95,18 @@ class TrainingRun:
 
 
 def train(
-    recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
+    recipe: Recipe,
+    dataset: str | Path,
+    out: str | Path,
+    *,
+    minutes: float | None = None,
+    show: bool = True,
 ) -> TrainingRun:
-    """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
-    ``minutes``: stop, with everything saved, before an epoch that would outlast them; one is always trained. ``show``:
-    progress on stderr. Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a
-    dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named)."""
+    """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once
+    if it is finished. ``minutes``: stop, with everything saved, before an epoch that would outlast
+    them; one is always trained. ``show``: progress on stderr. Raises `TrainingError` for a folder
+    of another recipe or dataset, a damaged checkpoint, a dataset of another image size, a loss that
+    is not finite or has diverged (the batch's samples are named)."""
     out, started = Path(out), perf_counter()
     data, validation = open_data(recipe, Path(dataset))
     state = PartialState()
@@ -120,7 +128,8 @@ def train(
 
 
 def finished_run(out: Path) -> TrainingRun | None:
-    """The finished training in the folder ``out``; None where there is none. `TrainingError` for a damaged one."""
+    """The finished training in the folder ``out``; None where there is none. `TrainingError` for a
+    damaged one."""
     path = out / DONE
     if not path.exists() or not (out / WEIGHTS).exists():
         return None
@@ -133,59 +142,79 @@ def finished_run(out: Path) -> TrainingRun | None:
 
 
 def epoch_order(pairs: int, drawn: int | None, seed: int, epoch: int) -> list[int]:
-    """Indices of epoch ``epoch`` (from 0): all ``pairs`` in a new order, or the next ``drawn`` of one shuffled round of
-    all pairs after the other: every pair comes once before any comes twice."""
+    """Indices of epoch ``epoch`` (from 0): all ``pairs`` in a new order, or the next ``drawn`` of
+    one shuffled round of all pairs after the other: every pair comes once before any comes
+    twice."""
     drawn = min(drawn or pairs, pairs)
     first = epoch * drawn
     turns = range(first // pairs, (first + drawn - 1) // pairs + 1)
-    rounds = np.concatenate([np.random.default_rng([seed, turn]).permutation(pairs) for turn in turns])
+    rounds = np.concatenate(
+        [np.random.default_rng([seed, turn]).permutation(pairs) for turn in turns]
+    )
     return rounds[first % pairs :][:drawn].tolist()
 
 
 def spread(pairs: int, drawn: int | None) -> list[int]:
-    """``drawn`` indices (all, if None) evenly over ``pairs``, always the same: each in its own stretch of the pairs, at
-    a place that walks through it by the golden ratio, so that views and the frames within them come evenly."""
+    """``drawn`` indices (all, if None) evenly over ``pairs``, always the same: each in its own
+    stretch of the pairs, at a place that walks through it by the golden ratio, so that views and
+    the frames within them come evenly."""
     if drawn is None or drawn >= pairs:
         return list(range(pairs))
     return [int((place + place * GOLDEN % 1) * pairs / drawn) for place in range(drawn)]
 
 
 def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:
-    """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
+    """Training and validation pairs. TrainingError for another image size than the recipe's, or an
+    empty split."""
     datasets = []
     parts = {} if recipe.fold is None else fold_samples(DatasetFolder(dataset), recipe.fold)
     for split in ("train", "validation"):
         data = FringeDepthDataset(
-            dataset, split, recipe.frames, recipe.normalisation, recipe.background_removed, samples=parts.get(split)
+            dataset,
+            split,
+            recipe.frames,
+            recipe.normalisation,
+            recipe.background_removed,
+            samples=parts.get(split),
         )
         if data.source.size != (recipe.size, recipe.size):
             height, width = data.source.size
             raise TrainingError(
-                f"{dataset}: holds images of {width} x {height} px, recipe {recipe.name} with preset {recipe.preset} "
-                f"expects {recipe.size} x {recipe.size}; build the size it needs: fpp-bench build --out DIR "
+                f"{dataset}: holds images of {width} x {height} px, recipe {recipe.name} with "
+                f"preset {recipe.preset} "
+                f"expects {recipe.size} x {recipe.size}; build the size it needs: fpp-bench build "
+                f"--out DIR "
                 f"--preset full --size {recipe.size}"
             )
         if not len(data):
-            raise TrainingError(f"{dataset}: split {split} holds no sample; training needs train and validation")
+            raise TrainingError(
+                f"{dataset}: split {split} holds no sample; training needs train and validation"
+            )
         datasets.append(data)
     return datasets[0], datasets[1]
 
 
 def fold_samples(data: DatasetFolder, fold: tuple[int, int]) -> dict[str, list[str]]:
-    """The samples of each split for part k of n of a cross-validation over all objects of ``data``, whatever their
-    split: part k is ``test``, every second object of the next part ``validation``, all others ``train``. The objects
-    are dealt in the order of their names' hashes, which is as good as shuffled and the same everywhere."""
+    """The samples of each split for part k of n of a cross-validation over all objects of ``data``,
+    whatever their split: part k is ``test``, every second object of the next part ``validation``,
+    all others ``train``. The objects are dealt in the order of their names' hashes, which is as
+    good as shuffled and the same everywhere."""
     part, parts = fold
     owners = {sample: split_sample_name(sample)[0] for sample in data.samples(ALL_SPLITS)}
     objects = sorted(set(owners.values()), key=lambda name: sha256(name.encode()).digest())
     test, validation = objects[part::parts], objects[(part + 1) % parts :: parts][::2]
-    splits = {name: "test" if name in test else "validation" if name in validation else "train" for name in objects}
-    return {split: [sample for sample in owners if splits[owners[sample]] == split] for split in SPLITS}
+    splits = {
+        name: "test" if name in test else "validation" if name in validation else "train"
+        for name in objects
+    }
+    return {
+        split: [sample for sample in owners if splits[owners[sample]] == split] for split in SPLITS
+    }
 
 
 def rate_after(rule: Plateau | Linear, rate: float, losses: Sequence[float]) -> float:
-    """Learning rate of the epoch after those with these validation ``losses``, from the first ``rate``; a plateau as
-    torch's ``ReduceLROnPlateau`` counts it."""
+    """Learning rate of the epoch after those with these validation ``losses``, from the first
+    ``rate``; a plateau as torch's ``ReduceLROnPlateau`` counts it."""
     if isinstance(rule, Linear):
         return rate * min(1.0, max(0, rule.constant + rule.decay - len(losses)) / rule.decay)
     best, bad = math.inf, 0
@@ -200,17 +229,20 @@ def rate_after(rule: Plateau | Linear, rate: float, losses: Sequence[float]) -> 
 
 
 def at_minimum(rule: Plateau | Linear, rate: float) -> bool:
-    """Whether a training ends at ``rate``: that of a plateau is at its minimum, or a linear one at 0."""
+    """Whether a training ends at ``rate``: that of a plateau is at its minimum, or a linear one at
+    0."""
     return rate <= getattr(rule, "minimum", 0.0) * (1 + _RELATIVE)
 
 
 class DepthTraining(Training):
-    """`Training` of a recipe in epochs, on pairs of a fringe image and depth; every epoch is validated. ``epochs``: at
-    most; a plateau may end it sooner."""
+    """`Training` of a recipe in epochs, on pairs of a fringe image and depth; every epoch is
+    validated. ``epochs``: at most; a plateau may end it sooner."""
 
     objective: Regression | Adversarial
 
-    def __init__(self, recipe: Recipe, data: FringeDepthDataset, validation: FringeDepthDataset, out: Path) -> None:
+    def __init__(
+        self, recipe: Recipe, data: FringeDepthDataset, validation: FringeDepthDataset, out: Path
+    ) -> None:
         identity = {"recipe": recipe.digest, "fingerprint": data.source.fingerprint}
         if recipe.normalisation == "individual":
             identity["range_rule"] = data.range_rule
@@ -225,7 +257,9 @@ class DepthTraining(Training):
             settings = AdversarialSettings.of(recipe.loss.alpha)
             self.objective = Adversarial(network, discriminator(width=recipe.width), settings)
         else:
-            self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha, self._physics(data))
+            self.objective = Regression(
+                network, recipe.loss.name, recipe.loss.alpha, self._physics(data)
+            )
         self.bare = dict(self.objective.modules)
         modules: dict[str, Any] = dict(self.bare)
         on_gpu = self.accelerator.device.type == "cuda"
@@ -236,7 +270,12 @@ class DepthTraining(Training):
             modules = {name: torch.compile(module) for name, module in modules.items()}
         rule = recipe.optimizer
         self.optimizers = {
-            name: RMSprop(module.parameters(), rule.learning_rate, alpha=rule.alpha, weight_decay=rule.weight_decay)
+            name: RMSprop(
+                module.parameters(),
+                rule.learning_rate,
+                alpha=rule.alpha,
+                weight_decay=rule.weight_decay,
+            )
             for name, module in modules.items()
         }
         for name, module in modules.items():
@@ -245,16 +284,22 @@ class DepthTraining(Training):
         self.resume()
 
     def _physics(self, data: FringeDepthDataset) -> Callable[[Tensor, Tensor], Tensor] | None:
-        """The re-projection term of the recipe's loss for a dataset's rig, None where the recipe has none."""
+        """The re-projection term of the recipe's loss for a dataset's rig, None where the recipe
+        has none."""
         weight = self.recipe.loss.physics
         if weight is None:
             return None
         rig = data.source.rig
         layer = CalibrationLayer.of(rig, "horizontal").tensors(device=self.accelerator.device)
-        unit_mm, nearest_mm = MM_PER_M if self.recipe.normalisation == "global" else 1.0, rig.working_range_mm[0] / 2
+        unit_mm, nearest_mm = (
+            MM_PER_M if self.recipe.normalisation == "global" else 1.0,
+            rig.working_range_mm[0] / 2,
+        )
 
         def term(prediction: Tensor, target: Tensor) -> Tensor:
-            return weight * re_projection_loss(layer, prediction * unit_mm, target * unit_mm, nearest_mm)
+            return weight * re_projection_loss(
+                layer, prediction * unit_mm, target * unit_mm, nearest_mm
+            )
 
         return term
 
@@ -273,21 +318,34 @@ class DepthTraining(Training):
 
     @property
     def over(self) -> bool:
-        return super().over or (self.epoch > 0 and at_minimum(self.recipe.schedule, self.learning_rate))
+        return super().over or (
+            self.epoch > 0 and at_minimum(self.recipe.schedule, self.learning_rate)
+        )
 
     def _indices(self) -> list[list[int]]:
-        """The pairs of each batch of this process in the coming epoch; all processes have as many batches."""
+        """The pairs of each batch of this process in the coming epoch; all processes have as many
+        batches."""
         size, processes = self.recipe.batch, self.accelerator.num_processes
-        order = epoch_order(len(self.data), self.recipe.pairs_per_epoch, self.recipe.seed, self.epoch)
+        order = epoch_order(
+            len(self.data), self.recipe.pairs_per_epoch, self.recipe.seed, self.epoch
+        )
         if processes > 1:
-            order = np.resize(order, -(-len(order) // (size * processes)) * size * processes).tolist()
+            order = np.resize(
+                order, -(-len(order) // (size * processes)) * size * processes
+            ).tolist()
         batches = [order[start : start + size] for start in range(0, len(order), size)]
         return batches[self.accelerator.process_index :: processes]
 
     def batches(self) -> Iterator[FringeDepth]:
-        # What is drawn within an epoch (DropPath) depends on the epoch alone: a resumed training draws the same.
-        set_seed((self.recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index) % 2**32)
-        torch.empty((), dtype=torch.int64).random_()  # as a DataLoader draws: published weights come out again
+        # What is drawn within an epoch (DropPath) depends on the epoch alone: a resumed training
+        # draws the same.
+        set_seed(
+            (self.recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index)
+            % 2**32
+        )
+        torch.empty(
+            (), dtype=torch.int64
+        ).random_()  # as a DataLoader draws: published weights come out again
         for indices in self._indices():
             yield self._on_device(self.data.read(indices))
 
@@ -302,10 +360,14 @@ class DepthTraining(Training):
 
     def diverged(self, name: str, value: float, number: int) -> str:
         fault = f"is {DIVERGED:g} times the first one" if math.isfinite(value) else "is not finite"
-        samples = sorted({self.data.samples[self.data.pair(index)[0]] for index in self._indices()[number]})
+        samples = sorted(
+            {self.data.samples[self.data.pair(index)[0]] for index in self._indices()[number]}
+        )
         return (
-            f"training diverged: {name} {fault} ({value:.4g}) in epoch {self.epoch + 1}, batch {number + 1}, samples "
-            f"{', '.join(samples)}. The last good state is kept ({self.epoch} epochs); lower the learning rate, or "
+            f"training diverged: {name} {fault} ({value:.4g}) in epoch {self.epoch + 1}, batch "
+            f"{number + 1}, samples "
+            f"{', '.join(samples)}. The last good state is kept ({self.epoch} epochs); lower the "
+            f"learning rate, or "
             "look at those samples (fpp-bench show)"
         )
 
@@ -314,7 +376,8 @@ class DepthTraining(Training):
         loss = scores["validation_loss"]
         if loss is None or not math.isfinite(loss) or loss > self.limit:
             raise TrainingError(
-                f"{self.out}: training diverged: the validation loss after epoch {self.epoch + 1} is {loss}. The last "
+                f"{self.out}: training diverged: the validation loss after epoch {self.epoch + 1} "
+                f"is {loss}. The last "
                 f"good state is kept ({self.epoch} epochs); lower the learning rate"
             )
         training_loss = losses.pop("loss")
@@ -326,15 +389,18 @@ class DepthTraining(Training):
             **losses,
             "seconds": round(perf_counter() - began, 3),
         }
-        if all(loss < before["validation_loss"] for before in self.history) and self.accelerator.is_main_process:
+        if (
+            all(loss < before["validation_loss"] for before in self.history)
+            and self.accelerator.is_main_process
+        ):
             network, data = self.bare["network"], self.data
             config = model_config(self.recipe, network, data.source, self.epoch + 1, scores)
             save_weights(self.out / WEIGHTS, network, replace(config, range_rule=data.range_rule))
         return record
 
     def _validate(self) -> dict[str, float | None]:
-        """``validation_loss`` and the scores in `LOGGED` of the network (not distributed, not compiled): means over the
-        pairs of all processes, None where no pair has such a pixel."""
+        """``validation_loss`` and the scores in `LOGGED` of the network (not distributed, not
+        compiled): means over the pairs of all processes, None where no pair has such a pixel."""
         network, accelerator = self.bare["network"], self.accelerator
         pairs = spread(len(self.validation), self.recipe.validation_pairs)
         indices = pairs[accelerator.process_index :: accelerator.num_processes]
@@ -348,11 +414,16 @@ class DepthTraining(Training):
             batch = self._on_device(read)
             with torch.inference_mode(), accelerator.autocast():
                 prediction = network(batch.fringe).float()
-                losses += self.objective.validation_losses(prediction, batch).double().cpu().tolist()
+                losses += (
+                    self.objective.validation_losses(prediction, batch).double().cpu().tolist()
+                )
             for values, row in zip(prediction[:, 0].cpu().numpy(), read.row.tolist(), strict=True):
                 sample = self.validation.samples[row]
                 if not np.isfinite(values).all():
-                    raise TrainingError(f"{self.out}: the network's answer to {sample} is not finite; it has diverged")
+                    raise TrainingError(
+                        f"{self.out}: the network's answer to {sample} is not finite; it has "
+                        f"diverged"
+                    )
                 source = self.validation.source
                 left_out = source.left_out(sample, self.validation.range_rule)
                 pair = scored_pair(values, source.depth_mm(sample), units, mode, sample, left_out)
@@ -365,20 +436,34 @@ class DepthTraining(Training):
 
     def progress(self) -> str:
         record = self.history[-1]
-        score, losses = record["object_mae_mm"], (record["training_loss"], record["validation_loss"])
+        score, losses = (
+            record["object_mae_mm"],
+            (record["training_loss"], record["validation_loss"]),
+        )
         shown, rate = "-" if score is None else f"{score:.1f} mm", record["learning_rate"]
         epoch = f"epoch {record['epoch']}/{self.epochs}"
         return f"{epoch}  loss {losses[0]:.4g} / {losses[1]:.4g}  object {shown}  rate {rate:.1e}"
 
     def panels(self) -> list[Panel]:
-        labels, kept = {"training_loss": "training", "validation_loss": "validation"}, self.best["epoch"]
+        labels, kept = (
+            {"training_loss": "training", "validation_loss": "validation"},
+            self.best["epoch"],
+        )
         losses = Panel.of("loss", self.history, "epoch", labels, log=True)
         losses.lines[f"kept: epoch {kept}"] = ([kept], [self.best["validation_loss"]])
-        object_mae = Panel.of("validation object MAE, mm", self.history, "epoch", {"object_mae_mm": "_"})
-        return [losses, object_mae, Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True)]
+        object_mae = Panel.of(
+            "validation object MAE, mm", self.history, "epoch", {"object_mae_mm": "_"}
+        )
+        return [
+            losses,
+            object_mae,
+            Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True),
+        ]
 
 
-def model_config(recipe: Recipe, network: nn.Module, data: DatasetFolder, epoch: int, scores: Record) -> ModelConfig:
+def model_config(
+    recipe: Recipe, network: nn.Module, data: DatasetFolder, epoch: int, scores: Record
+) -> ModelConfig:
     """Configuration for the weights file of a network trained on ``data``."""
     return ModelConfig(
         name=recipe.name,

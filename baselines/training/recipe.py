@@ -1,5 +1,6 @@
-"""Recipes: a YAML file for each row of a table, with the differences from the recipe it extends (Sections 5.3-5.6).
-Resolved with a preset, which sets what depends on the machine, it is every number that a training depends on."""
+"""Recipes: a YAML file for each row of a table, with the differences from the recipe it extends
+(Sections 5.3-5.6). Resolved with a preset, which sets what depends on the machine, it is every
+number that a training depends on."""
 
 import hashlib
 import json
@@ -38,8 +39,9 @@ ROWS: dict[str, tuple[str, ...]] = {
     "architecture": ("unet", "transunet", "resunet", "pix2pix", "pix2pixhd", "hformer"),
     "further": ("plain", "guided", "physics"),
 }
-"""The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's. ``further`` is no table
-of the paper: two of its further directions, and the network without them."""
+"""The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's.
+``further`` is no table of the paper: two of its further directions, and the network without
+them."""
 TABLES = tuple(ROWS)
 PRESETS = ("small", "paper")
 SEED = 42
@@ -61,14 +63,22 @@ _OPTION_TITLES = {"standardised": "input standardised", "guided": "guided by pha
 
 
 def check_loss(name: str, alpha: float | None) -> None:
-    """Raise `RecipeError` unless ``name`` is one of `LOSSES` and ``alpha`` is given exactly where it has a meaning."""
+    """Raise `RecipeError` unless ``name`` is one of `LOSSES` and ``alpha`` is given exactly where
+    it has a meaning."""
     if name not in LOSSES:
         raise RecipeError(f"unknown loss {name!r}; there are {', '.join(LOSSES)}")
     hybrid = name.startswith("hybrid_")
     if not hybrid and alpha is not None:
-        raise RecipeError(f"loss {name} takes no alpha, got {alpha!r}; leave it out, or name hybrid_rmse or hybrid_l1")
-    if hybrid and (isinstance(alpha, bool) or not isinstance(alpha, int | float) or not 0 <= alpha <= 1):
-        raise RecipeError(f"loss {name} needs alpha, the weight of the object's part, from 0 to 1, got {alpha!r}")
+        raise RecipeError(
+            f"loss {name} takes no alpha, got {alpha!r}; leave it out, or name hybrid_rmse or "
+            f"hybrid_l1"
+        )
+    if hybrid and (
+        isinstance(alpha, bool) or not isinstance(alpha, int | float) or not 0 <= alpha <= 1
+    ):
+        raise RecipeError(
+            f"loss {name} needs alpha, the weight of the object's part, from 0 to 1, got {alpha!r}"
+        )
 
 
 class RmsProp(StrictModel):
@@ -81,7 +91,8 @@ class RmsProp(StrictModel):
 
 
 class Plateau(StrictModel):
-    """The rate times ``factor`` after more than ``patience`` epochs without a lower loss; over at ``minimum``."""
+    """The rate times ``factor`` after more than ``patience`` epochs without a lower loss; over at
+    ``minimum``."""
 
     name: Literal["plateau"]
     factor: Annotated[float, Field(gt=0, lt=1)]
@@ -90,7 +101,8 @@ class Plateau(StrictModel):
 
 
 class Linear(StrictModel):
-    """The rate constant for ``constant`` epochs, then down to zero in a line over ``decay`` epochs; then done."""
+    """The rate constant for ``constant`` epochs, then down to zero in a line over ``decay`` epochs;
+    then done."""
 
     name: Literal["linear"]
     constant: Annotated[int, Field(ge=0)]
@@ -121,10 +133,11 @@ class Loss(StrictModel):
 
 
 class Recipe(StrictModel):
-    """Everything that a training depends on. ``size``: the image's width and height in px. ``pairs_per_epoch`` are
-    drawn for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``frames``: those that
-    are training pairs of their own, one of `CONFIGS`. ``options`` go to `networks.build`. ``fold``: k of n, for a
-    training without the objects of part k (from 0) of all, dealt into n parts; null trains on the training split."""
+    """Everything that a training depends on. ``size``: the image's width and height in px.
+    ``pairs_per_epoch`` are drawn for each epoch, ``validation_pairs`` evenly over the validation
+    split; null takes all. ``frames``: those that are training pairs of their own, one of `CONFIGS`.
+    ``options`` go to `networks.build`. ``fold``: k of n, for a training without the objects of part
+    k (from 0) of all, dealt into n parts; null trains on the training split."""
 
     preset: Text
     size: Annotated[int, Field(ge=16)]
@@ -137,7 +150,12 @@ class Recipe(StrictModel):
     loss: Loss
     optimizer: RmsProp
     schedule: Annotated[Plateau | Linear, Field(discriminator="name")]
-    fold: Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=3)]], Field(strict=False)] | None = None
+    fold: (
+        Annotated[
+            tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=3)]], Field(strict=False)
+        ]
+        | None
+    ) = None
     batch: Annotated[int, Field(ge=1)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     max_epochs: Annotated[int, Field(ge=1)]
@@ -149,7 +167,9 @@ class Recipe(StrictModel):
     @model_validator(mode="after")
     def _consistent(self) -> "Recipe":
         if self.network not in NETWORK_TITLES:
-            raise ValueError(f"network: expected one of {', '.join(NETWORK_TITLES)}, got {self.network!r}")
+            raise ValueError(
+                f"network: expected one of {', '.join(NETWORK_TITLES)}, got {self.network!r}"
+            )
         if {"width", "name"} & set(self.options):
             raise ValueError("options: width and network are keys of their own, and no options")
         if self.frames not in CONFIGS:
@@ -157,13 +177,20 @@ class Recipe(StrictModel):
         if (self.loss.name == GAN) != (self.network in GENERATORS):
             raise ValueError(f"loss gan and network {' or '.join(GENERATORS)} belong together")
         if self.fold is not None and self.fold[0] >= self.fold[1]:
-            raise ValueError(f"fold: expected a part from 0 to {self.fold[1] - 1}, got {self.fold[0]}")
-        if self.loss.physics is not None and (self.normalisation == "individual" or self.frames != "single_shot"):
             raise ValueError(
-                "loss: physics needs depth in mm or m, of frame 0 (normalisation raw or global, frames single_shot)"
+                f"fold: expected a part from 0 to {self.fold[1] - 1}, got {self.fold[0]}"
+            )
+        if self.loss.physics is not None and (
+            self.normalisation == "individual" or self.frames != "single_shot"
+        ):
+            raise ValueError(
+                "loss: physics needs depth in mm or m, of frame 0 (normalisation raw or global, "
+                "frames single_shot)"
             )
         if self.network in GENERATORS and self.normalisation != "individual":
-            raise ValueError(f"network {self.network} answers in [0, 1], so its normalisation must be individual")
+            raise ValueError(
+                f"network {self.network} answers in [0, 1], so its normalisation must be individual"
+            )
         return self
 
     @property
@@ -179,8 +206,13 @@ class Recipe(StrictModel):
 
     @property
     def title(self) -> str:
-        """For people: network, normalisation, loss, and the settings that differ from the paper's usual ones."""
-        parts = [NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
+        """For people: network, normalisation, loss, and the settings that differ from the paper's
+        usual ones."""
+        parts = [
+            NETWORK_TITLES[self.network],
+            self.normalisation,
+            self.loss.label.replace("_", " "),
+        ]
         parts += ["background removed"] if self.background_removed else []
         parts += [title for flag, title in _OPTION_TITLES.items() if self.options.get(flag)]
         parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
@@ -192,7 +224,9 @@ class Recipe(StrictModel):
     def epochs(self) -> int:
         """At most; a plateau may end the training sooner."""
         schedule, most = self.schedule, self.max_epochs
-        return min(schedule.constant + schedule.decay, most) if isinstance(schedule, Linear) else most
+        return (
+            min(schedule.constant + schedule.decay, most) if isinstance(schedule, Linear) else most
+        )
 
     def to_dict(self) -> dict[str, Any]:
         return self.model_dump(mode="json")
@@ -221,20 +255,23 @@ def about_preset(preset: str) -> str:
 
 
 def load_recipe(name_or_path: str | Path, preset: str = PRESETS[0]) -> Recipe:
-    """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a preset, which scales
-    the shipped recipes alone. RecipeError for an unknown recipe, preset or key, an impossible value, or an endless
-    chain of ``extends``."""
+    """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a
+    preset, which scales the shipped recipes alone. RecipeError for an unknown recipe, preset or
+    key, an impossible value, or an endless chain of ``extends``."""
     path = _recipe_path(name_or_path)
     shipped, own = _resolved(path, 0)
     content = _merge(shipped, own)
     network = content.get("network")
     if not isinstance(network, str) or network not in NETWORK_TITLES:
         raise RecipeError(
-            f"{path}: network: expected one of {', '.join(NETWORK_TITLES)}, got {printable(repr(network), 60)}"
+            f"{path}: network: expected one of {', '.join(NETWORK_TITLES)}, got "
+            f"{printable(repr(network), 60)}"
         )
     scale = _preset(preset)
     merged = _merge(shipped, scale["every"], pick=True)
-    merged = _merge(merged, scale["normalisations"].get(str(content.get("normalisation")), {}), pick=True)
+    merged = _merge(
+        merged, scale["normalisations"].get(str(content.get("normalisation")), {}), pick=True
+    )
     merged = _merge(_merge(merged, scale["networks"].get(network, {})), own)
     return recipe_from_dict({"size": scale["size"], **merged, "preset": preset}, path)
 
@@ -260,26 +297,38 @@ def _recipe_path(name_or_path: str | Path) -> Path:
         names = [*(f"{table}/{row}" for table in TABLES for row in ROWS[table]), "base"]
         closest = nearest(text, names, 3) or names[:3]
         raise RecipeError(
-            f"no recipe {printable(text, 100)!r}; near it: {', '.join(closest)}. Give one of the shipped names (see "
+            f"no recipe {printable(text, 100)!r}; near it: {', '.join(closest)}. Give one of the "
+            f"shipped names (see "
             "fpp-bench reproduce --list) or a .yaml file"
         )
     return path
 
 
 def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Content of a recipe merged over the recipes it extends: that of shipped recipes, and that of the user's files."""
+    """Content of a recipe merged over the recipes it extends: that of shipped recipes, and that of
+    the user's files."""
     if depth > _LONGEST_CHAIN:
-        raise RecipeError(f"{path}: more than {_LONGEST_CHAIN} recipes extend one another; does one extend itself?")
+        raise RecipeError(
+            f"{path}: more than {_LONGEST_CHAIN} recipes extend one another; does one extend "
+            f"itself?"
+        )
     content = _read(path)
     parent = content.pop("extends", None)
     is_users_own = not path.resolve().is_relative_to(RECIPES)
     if parent is None:
         return ({}, content) if is_users_own else (content, {})
     if not isinstance(parent, str):
-        raise RecipeError(f"{path}: extends: expected a recipe's name, like base, got {printable(repr(parent), 60)}")
+        raise RecipeError(
+            f"{path}: extends: expected a recipe's name, like base, got "
+            f"{printable(repr(parent), 60)}"
+        )
     beside = path.parent / parent
     try:
-        extended = beside if beside.suffix in (".yaml", ".yml") and is_file(beside) else _recipe_path(parent)
+        extended = (
+            beside
+            if beside.suffix in (".yaml", ".yml") and is_file(beside)
+            else _recipe_path(parent)
+        )
     except RecipeError as error:
         raise RecipeError(f"{path}: extends: {error}") from None
     shipped, own = _resolved(extended, depth + 1)
@@ -287,12 +336,18 @@ def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> dict[str, Any]:
-    """``above`` over ``below``; mappings key by key, but one with a ``name`` of its own, or ``options``, as a whole.
-    ``pick``: keys of nested mappings that ``below`` does not have (another kind of schedule) are left out."""
+    """``above`` over ``below``; mappings key by key, but one with a ``name`` of its own, or
+    ``options``, as a whole. ``pick``: keys of nested mappings that ``below`` does not have (another
+    kind of schedule) are left out."""
     merged = dict(below)
     for key, value in above.items():
         old = below.get(key)
-        if isinstance(value, dict) and isinstance(old, dict) and "name" not in value and key != "options":
+        if (
+            isinstance(value, dict)
+            and isinstance(old, dict)
+            and "name" not in value
+            and key != "options"
+        ):
             merged[key] = {**old, **{k: v for k, v in value.items() if not pick or k in old}}
         else:
             merged[key] = value

@@ -1,17 +1,20 @@
-"""Draw the meshes that come with the package: the benchmark's 50 objects and the 20 of the set ``unseen``.
+"""Draw the meshes that come with the package: the benchmark's 50 objects and the 20 of the set
+``unseen``.
 
     pip install -e ".[objects]"
     python benchmarks/objects/draw.py                      all, into loaders/render/objects.npz
     python benchmarks/objects/draw.py --check banana gear  do these drawings give the meshes that are there?
 
-Each of the 50 is drawn in millimetres at its real size, in a pose that shows it to the camera of the first view, and
-enlarged. The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all; ours depart from
-it where its image statistics need it: a view covers 3 to 40% of the image and a tenth on average, half the views span
-less than about 80 mm in depth. Source: own shapes after the names of the YCB and warehouse objects that the paper
-scanned. The unseen ones are drawn at the size that they have in the scene.
+Each of the 50 is drawn in millimetres at its real size, in a pose that shows it to the camera of
+the first view, and enlarged. The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to
+5, boards not at all; ours depart from it where its image statistics need it: a view covers 3 to 40%
+of the image and a tenth on average, half the views span less than about 80 mm in depth. Source: own
+shapes after the names of the YCB and warehouse objects that the paper scanned. The unseen ones are
+drawn at the size that they have in the scene.
 
-The bytes depend on the version of manifold3d, so the meshes are frozen data, and ``--check`` needs the pinned one. Exit
-status 1 if a drawing is another than the mesh in the package, 2 for an unknown name.
+The bytes depend on the version of manifold3d, so the meshes are frozen data, and ``--check`` needs
+the pinned one. Exit status 1 if a drawing is another than the mesh in the package, 2 for an unknown
+name.
 """
 
 import argparse
@@ -45,9 +48,15 @@ def drawing(name: str) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
 
 def main() -> int:
     """Draw and write, or draw and compare."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="compare with the meshes in the package, write nothing")
-    parser.add_argument("names", nargs="*", help="objects (default: all); without --check all are drawn")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="compare with the meshes in the package, write nothing"
+    )
+    parser.add_argument(
+        "names", nargs="*", help="objects (default: all); without --check all are drawn"
+    )
     arguments = parser.parse_args()
     names = arguments.names if arguments.check and arguments.names else [*OBJECTS, *UNSEEN]
     if not arguments.check:

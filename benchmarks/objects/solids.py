@@ -1,9 +1,11 @@
-"""Solids the 50 objects are made of: turned, boxed, extruded, swept, lofted and joined, all in millimetres.
+"""Solids the 50 objects are made of: turned, boxed, extruded, swept, lofted and joined, all in
+millimetres.
 
-Everything here is a :class:`manifold3d.Manifold`, closed by construction, so that unions and cuts stay watertight.
-Two drawing frames are used. *Upright* solids (bottles, cans) stand on z = 0 with z up and their front towards -x,
-where the camera stands at the first view. *Drawn* solids (scissors, lettering) are laid out in the xy plane as the
-viewer sees them, z towards the viewer, and :func:`facing` stands them up. Source: own.
+Everything here is a :class:`manifold3d.Manifold`, closed by construction, so that unions and cuts
+stay watertight. Two drawing frames are used. *Upright* solids (bottles, cans) stand on z = 0 with z
+up and their front towards -x, where the camera stands at the first view. *Drawn* solids (scissors,
+lettering) are laid out in the xy plane as the viewer sees them, z towards the viewer, and
+:func:`facing` stands them up. Source: own.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,8 +28,11 @@ Level = tuple[float, float, float, float]
 DRAWINGS: dict[str, Callable[[], Solid]] = {}
 """What makes each object, by its name, as it stands in the scene, in mm."""
 GRID_MM = 2.0**-14
-"""Solids are put on this grid before they are joined or cut, so that booleans decide alike on every processor."""
-SEGMENTS = 120  # round a turned part: chord error 0.05 mm at a radius of 150 mm, a fifteenth of a pixel at 1.8 m
+"""Solids are put on this grid before they are joined or cut, so that booleans decide alike on every
+processor."""
+SEGMENTS = 120
+"""Round a turned part: chord error 0.05 mm at a radius of 150 mm, a fifteenth of a pixel at 1.8
+m."""
 SMALL_SEGMENTS = 48  # round parts of less than 20 mm radius
 TINY_SEGMENTS = 24  # round parts of less than 4 mm radius
 
@@ -38,8 +43,8 @@ def segments_for(radius: float) -> int:
 
 
 def on_grid(solid: Solid, grid_mm: float = GRID_MM) -> Solid:
-    """The solid with its vertices on a grid. The last bits of sines and cosines, which differ between processors, are
-    gone then."""
+    """The solid with its vertices on a grid. The last bits of sines and cosines, which differ
+    between processors, are gone then."""
     return solid.warp_batch(lambda vertices: np.rint(vertices / grid_mm) * grid_mm)
 
 
@@ -59,23 +64,28 @@ def place(solid: Solid, at: Point3 = (0, 0, 0), turn: Point3 = (0, 0, 0)) -> Sol
 
 
 def facing(solid: Solid) -> Solid:
-    """A drawn solid (x right, y up, z to the viewer) stood up before the camera of the first view."""
+    """A drawn solid (x right, y up, z to the viewer) stood up before the camera of the first
+    view."""
     return solid.rotate((90, 0, -90))
 
 
 def laid(solid: Solid) -> Solid:
-    """An upright solid laid into the drawing frame, its front towards the viewer: the inverse of :func:`facing`."""
+    """An upright solid laid into the drawing frame, its front towards the viewer: the inverse of
+    :func:`facing`."""
     return solid.rotate((0, 0, 90)).rotate((-90, 0, 0))
 
 
 def upright(
     enlarged: float, *turns: Point3, stood: Callable[[Solid], Solid] = lambda solid: solid
 ) -> Callable[[Callable[[], Solid]], Callable[[], Solid]]:
-    """Make an object of a function that draws an upright solid at its real size: it stands in the scene turned by
-    degrees about x, then y, then z, by one of ``turns`` after the other, and ``enlarged``."""
+    """Make an object of a function that draws an upright solid at its real size: it stands in the
+    scene turned by degrees about x, then y, then z, by one of ``turns`` after the other, and
+    ``enlarged``."""
 
     def add(draw: Callable[[], Solid]) -> Callable[[], Solid]:
-        DRAWINGS[draw.__name__] = lambda: reduce(Solid.rotate, turns, stood(draw())).scale((enlarged,) * 3)
+        DRAWINGS[draw.__name__] = lambda: reduce(Solid.rotate, turns, stood(draw())).scale(
+            (enlarged,) * 3
+        )
         return draw
 
     return add
@@ -86,14 +96,16 @@ drawn = partial(upright, stood=facing)
 
 
 def embossed(body: Solid, section: Section, relief: float) -> Solid:
-    """A drawn section pressed out of the front of an upright body by about ``relief`` mm, following its surface."""
+    """A drawn section pressed out of the front of an upright body by about ``relief`` mm, following
+    its surface."""
     low_x, low_y, _, high_x, high_y, _ = body.bounding_box()
     grown = body.scale((1 + 2 * relief / (high_x - low_x), 1 + 2 * relief / (high_y - low_y), 1))
     return on_grid(grown) ^ on_grid(facing(section.extrude(-2 * low_x)))
 
 
 def polygon(points: Points, soften: float = 0.0) -> Section:
-    """Filled outline (N, 2) in mm, in either sense of turning; its corners rounded to radius ``soften``."""
+    """Filled outline (N, 2) in mm, in either sense of turning; its corners rounded to radius
+    ``soften``."""
     outline = CrossSection([np.asarray(points, dtype=np.float64)])
     if outline.area() <= 0:
         outline = CrossSection([np.asarray(points, dtype=np.float64)[::-1]])
@@ -101,7 +113,8 @@ def polygon(points: Points, soften: float = 0.0) -> Section:
 
 
 def softened(section: Section, radius: float) -> Section:
-    """The section with convex and concave corners rounded to ``radius`` mm (opened, then closed)."""
+    """The section with convex and concave corners rounded to ``radius`` mm (opened, then
+    closed)."""
     if radius <= 0:
         return section
     arcs = segments_for(radius)
@@ -112,7 +125,10 @@ def softened(section: Section, radius: float) -> Section:
 
 def stroke(points: Points, width: float) -> Section:
     """A polyline drawn with a round pen of ``width`` mm."""
-    dots = [CrossSection.circle(width / 2, SMALL_SEGMENTS).translate((float(x), float(y))) for x, y in points]
+    dots = [
+        CrossSection.circle(width / 2, SMALL_SEGMENTS).translate((float(x), float(y)))
+        for x, y in points
+    ]
     pieces = [(a + b).hull() for a, b in pairwise(dots)]
     return CrossSection.batch_boolean(pieces, OpType.Add)
 
@@ -128,7 +144,8 @@ def disc(radius: float, at: Point2 = (0, 0)) -> Section:
 
 
 def plate(section: Section, thickness: float, bevel: float = 0.0) -> Solid:
-    """The section as a plate between z = -thickness/2 and +thickness/2; ``bevel`` mm chamfers it if it is convex."""
+    """The section as a plate between z = -thickness/2 and +thickness/2; ``bevel`` mm chamfers it if
+    it is convex."""
     if bevel <= 0:
         return section.extrude(thickness).translate((0, 0, -thickness / 2))
     core = section.extrude(thickness - 2 * bevel).translate((0, 0, -thickness / 2 + bevel))
@@ -143,7 +160,8 @@ def _turned_section(profile: Points, soften: float) -> Section:
 
 
 def lathe(profile: Points, soften: float = 0.0, segments: int = SEGMENTS) -> Solid:
-    """Solid of revolution about z of (radius, height) points from bottom to top, corners rounded by ``soften``."""
+    """Solid of revolution about z of (radius, height) points from bottom to top, corners rounded by
+    ``soften``."""
     return Manifold.revolve(_turned_section(profile, soften), segments)
 
 
@@ -153,7 +171,9 @@ def vessel(profile: Points, wall: float, soften: float = 0.0) -> Solid:
     top = float(np.max(np.asarray(profile)[:, 1]))
     inner = outer.offset(-wall, JoinType.Round, 2.0, SMALL_SEGMENTS)
     mouth = float(np.asarray(profile)[-1, 0]) - wall
-    opening = CrossSection.square((2 * mouth, 3 * wall + 2 * soften), True).translate((0, top - wall / 2))
+    opening = CrossSection.square((2 * mouth, 3 * wall + 2 * soften), True).translate(
+        (0, top - wall / 2)
+    )
     inner = CrossSection.batch_boolean([inner, opening], OpType.Add)
     return Manifold.revolve((outer - inner).simplify(0.01), SEGMENTS)
 
@@ -169,7 +189,13 @@ def ball(radius: float, at: Point3 = (0, 0, 0)) -> Solid:
     return Manifold.sphere(radius, min(segments_for(radius), SMALL_SEGMENTS)).translate(at)
 
 
-def rod(start: Point3, end: Point3, radius: float, end_radius: float | None = None, rounded: bool = False) -> Solid:
+def rod(
+    start: Point3,
+    end: Point3,
+    radius: float,
+    end_radius: float | None = None,
+    rounded: bool = False,
+) -> Solid:
     """Round bar between two points, tapered to ``end_radius``, with flat or rounded ends."""
     axis = np.subtract(end, start)
     length = float(np.linalg.norm(axis))
@@ -178,33 +204,50 @@ def rod(start: Point3, end: Point3, radius: float, end_radius: float | None = No
         return (ball(radius, start) + ball(last, end)).hull()
     polar = float(np.degrees(np.arctan2(np.hypot(axis[0], axis[1]), axis[2])))
     azimuth = float(np.degrees(np.arctan2(axis[1], axis[0])))
-    return place(Manifold.cylinder(length, radius, last, segments_for(max(radius, last))), start, (0, polar, azimuth))
+    return place(
+        Manifold.cylinder(length, radius, last, segments_for(max(radius, last))),
+        start,
+        (0, polar, azimuth),
+    )
 
 
-def post(low: float, high: float, radius: float, end_radius: float | None = None, at: Point2 = (0, 0)) -> Solid:
+def post(
+    low: float, high: float, radius: float, end_radius: float | None = None, at: Point2 = (0, 0)
+) -> Solid:
     """A `rod` along z, from height ``low`` to ``high``."""
     return rod((*at, low), (*at, high), radius, end_radius)
 
 
-def block(width: float, depth: float, height: float, soften: float = 0.0, at: Point3 = (0, 0, 0)) -> Solid:
+def block(
+    width: float, depth: float, height: float, soften: float = 0.0, at: Point3 = (0, 0, 0)
+) -> Solid:
     """Box of size x, y, z centred at ``at``, edges and corners rounded to ``soften``."""
     if soften <= 0:
         return Manifold.cube((width, depth, height), True).translate(at)
     corner = Manifold.sphere(soften, 24)
     x, y, z = width / 2 - soften, depth / 2 - soften, height / 2 - soften
-    corners = [corner.translate((i * x, j * y, k * z)) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]
+    corners = [
+        corner.translate((i * x, j * y, k * z)) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)
+    ]
     return Manifold.batch_hull(corners).translate(at)
 
 
 def curve(points: Points, per_span: int = 10) -> np.ndarray:
-    """Smooth curve (M, D) through control points (N, D): centripetal Catmull-Rom, ``per_span`` pieces each."""
+    """Smooth curve (M, D) through control points (N, D): centripetal Catmull-Rom, ``per_span``
+    pieces each."""
     control = np.asarray(points, dtype=np.float64)
-    padded = np.concatenate([2 * control[:1] - control[1:2], control, 2 * control[-1:] - control[-2:-1]])
-    knots = np.concatenate([[0.0], np.cumsum(np.sqrt(np.linalg.norm(np.diff(padded, axis=0), axis=1)))])
+    padded = np.concatenate(
+        [2 * control[:1] - control[1:2], control, 2 * control[-1:] - control[-2:-1]]
+    )
+    knots = np.concatenate(
+        [[0.0], np.cumsum(np.sqrt(np.linalg.norm(np.diff(padded, axis=0), axis=1)))]
+    )
     t = np.linspace(knots[1:-2], knots[2:-1], per_span, endpoint=False, axis=1)[..., None]
     count = len(control) - 1
 
-    def between(first: np.ndarray, second: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    def between(
+        first: np.ndarray, second: np.ndarray, low: np.ndarray, high: np.ndarray
+    ) -> np.ndarray:
         return ((high - t) * first + (t - low) * second) / (high - low)
 
     t0, t1, t2, t3 = (knots[k : k + count, None, None] for k in range(4))
@@ -212,11 +255,14 @@ def curve(points: Points, per_span: int = 10) -> np.ndarray:
     middle = between(p1, p2, t1, t2)
     before = between(between(p0, p1, t0, t1), middle, t0, t2)
     behind = between(middle, between(p2, p3, t2, t3), t1, t3)
-    return np.concatenate([between(before, behind, t1, t2).reshape(-1, control.shape[1]), control[-1:]])
+    return np.concatenate(
+        [between(before, behind, t1, t2).reshape(-1, control.shape[1]), control[-1:]]
+    )
 
 
 def symmetric(half: Points) -> np.ndarray:
-    """Outline through ``half`` (N, 2), which starts or ends on x = 0, and its mirror image: a `curve` through each."""
+    """Outline through ``half`` (N, 2), which starts or ends on x = 0, and its mirror image: a
+    `curve` through each."""
     mirrored = np.asarray(half, dtype=np.float64)[::-1] * (-1.0, 1.0)
     return np.concatenate([curve(half), curve(mirrored)[1:]])
 
@@ -227,8 +273,9 @@ def cushioned(section: Section, thickness: float, inset: float, middle: float) -
 
 
 def skin(rings: np.ndarray, closed: bool = False) -> Solid:
-    """Solid under rings of points (N, K, 3), each joined to the next; ``closed`` joins the last to the first. Ends that
-    are not closed are capped by a fan about the mean of their ring, so end rings should be star-shaped."""
+    """Solid under rings of points (N, K, 3), each joined to the next; ``closed`` joins the last to
+    the first. Ends that are not closed are capped by a fan about the mean of their ring, so end
+    rings should be star-shaped."""
     count, sides = rings.shape[:2]
     index = np.arange(count * sides).reshape(count, sides)
     here = index if closed else index[:-1]
@@ -261,7 +308,8 @@ def around(count: int) -> list[Point2]:
 
 
 def superellipse(width: float, depth: float, power: float = 2.0, sides: int = 120) -> np.ndarray:
-    """Outline (sides, 2) of |2x/width|^power + |2y/depth|^power = 1: an ellipse at 2, towards a rectangle above."""
+    """Outline (sides, 2) of |2x/width|^power + |2y/depth|^power = 1: an ellipse at 2, towards a
+    rectangle above."""
     cosine, sine = np.cos(angles(sides)), np.sin(angles(sides))
     x = np.sign(cosine) * np.abs(cosine) ** (2 / power)
     y = np.sign(sine) * np.abs(sine) ** (2 / power)
@@ -269,8 +317,8 @@ def superellipse(width: float, depth: float, power: float = 2.0, sides: int = 12
 
 
 def loft(levels: Points, smooth: int = 0, sides: int = 120) -> Solid:
-    """Upright solid through superellipses (`Level`), wide side to the camera. ``smooth`` above 0 passes a smooth curve
-    through the levels, with that many pieces between two of them."""
+    """Upright solid through superellipses (`Level`), wide side to the camera. ``smooth`` above 0
+    passes a smooth curve through the levels, with that many pieces between two of them."""
     rows = np.asarray(levels, dtype=np.float64)
     if smooth:
         rows = curve(rows, smooth)
@@ -289,8 +337,9 @@ def tube(
     closed: bool = False,
     sides: int = 32,
 ) -> Solid:
-    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3), of one ``radius`` or of one at each
-    point (N,). ``up`` fixes how an oval section lies: its radius towards ``up`` is ``flatten`` times the one across."""
+    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3), of one ``radius`` or
+    of one at each point (N,). ``up`` fixes how an oval section lies: its radius towards ``up`` is
+    ``flatten`` times the one across."""
     points = np.asarray(path, dtype=np.float64)
     if closed:
         tangents = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
@@ -340,7 +389,8 @@ _ROWS, _ADVANCE = 7, 6
 
 
 def text_section(text: str, width: float, at: Point2 = (0, 0)) -> Section:
-    """The text as a flat section, ``width`` mm wide, centred at ``at``; cells overlap a little where they meet."""
+    """The text as a flat section, ``width`` mm wide, centred at ``at``; cells overlap a little
+    where they meet."""
     runs = []
     for place, letter in enumerate(text):
         for row, digit in enumerate(_GLYPHS[letter]):
@@ -355,23 +405,36 @@ def text_section(text: str, width: float, at: Point2 = (0, 0)) -> Section:
 
 
 def text_plate(text: str, width: float, relief: float) -> Solid:
-    """Drawn text rising ``relief`` mm above z = 0 and reaching as deep below it, to be joined to a face."""
+    """Drawn text rising ``relief`` mm above z = 0 and reaching as deep below it, to be joined to a
+    face."""
     return text_section(text, width).extrude(2 * relief).translate((0, 0, -relief))
 
 
-def wrapped(section: Section, radius: float, height: float, relief: float, turn: float = 0.0) -> Solid:
-    """A flat section bent round an upright cylinder, centred at ``height`` on its front, ``relief`` mm proud of it."""
+def wrapped(
+    section: Section, radius: float, height: float, relief: float, turn: float = 0.0
+) -> Solid:
+    """A flat section bent round an upright cylinder, centred at ``height`` on its front, ``relief``
+    mm proud of it."""
     sunk = 2.0 * relief + 0.5
-    flat = section.extrude(sunk + relief).translate((0, 0, -sunk)).refine_to_length(max(radius / 12, 1.5))
+    flat = (
+        section.extrude(sunk + relief)
+        .translate((0, 0, -sunk))
+        .refine_to_length(max(radius / 12, 1.5))
+    )
 
     def bend(points: np.ndarray) -> np.ndarray:
         angle = points[:, 0] / radius
         reach = radius + points[:, 2]
-        return np.column_stack([-reach * np.cos(angle), -reach * np.sin(angle), points[:, 1] + height])
+        return np.column_stack(
+            [-reach * np.cos(angle), -reach * np.sin(angle), points[:, 1] + height]
+        )
 
     return flat.warp_batch(bend).rotate((0, 0, turn))
 
 
 def lettered(radius: float, relief: float, *lines: tuple[str, float, float]) -> list[Solid]:
     """Text lines (words, width, height) bent round an upright cylinder like `wrapped`."""
-    return [wrapped(text_section(words, width), radius, height, relief) for words, width, height in lines]
+    return [
+        wrapped(text_section(words, width), radius, height, relief)
+        for words, width, height in lines
+    ]

@@ -1,5 +1,6 @@
-"""The 20 objects of the set ``unseen``, of other kinds than the benchmark's 50: grooves and dishes that light
-themselves up, thin, tall and stepped parts, and families given by a formula. In mm, as large as they are in the scene.
+"""The 20 objects of the set ``unseen``, of other kinds than the benchmark's 50: grooves and dishes
+that light themselves up, thin, tall and stepped parts, and families given by a formula. In mm, as
+large as they are in the scene.
 """
 
 from collections.abc import Callable
@@ -77,7 +78,9 @@ def hinged_leaves() -> Solid:
 def step_wedge() -> Solid:
     """Eight steps of 12 to 40 mm, 300 mm wide."""
     rises = np.cumsum([12, 40, 16, 36, 20, 32, 24, 28]).tolist()
-    steps = [block(rise, 300, 44, 0, (-rise / 2, 0, 44 * (3.5 - k))) for k, rise in enumerate(rises)]
+    steps = [
+        block(rise, 300, 44, 0, (-rise / 2, 0, 44 * (3.5 - k))) for k, rise in enumerate(rises)
+    ]
     return union(*steps, block(40, 300, 352, 0, (18, 0, 0)))
 
 
@@ -95,7 +98,14 @@ def stair_tower() -> Solid:
 @drawn(1.0, (0, 5, 0))
 def thin_fin() -> Solid:
     """A bent sheet 5 mm thick with a swept outline, on a foot."""
-    outline = polygon([*curve([(-160, -170), (-110, -40), (-20, 90), (90, 190)]), (170, 190), (150, 20), (130, -170)])
+    outline = polygon(
+        [
+            *curve([(-160, -170), (-110, -40), (-20, 90), (90, 190)]),
+            (170, 190),
+            (150, 20),
+            (130, -170),
+        ]
+    )
     sheet = _bent(plate(outline, 5), lambda x, y: 55 * (x / 160) ** 2 - 30 * (y / 180) ** 2)
     return union(sheet, block(311, 91, 83, 6, (-4, -163, 3)))
 
@@ -104,15 +114,21 @@ def thin_fin() -> Solid:
 def wire_loop() -> Solid:
     """A closed wire, 20 mm thick, that swings to and fro in three directions."""
     turn = angles(360)
-    path = np.column_stack([120 * np.sin(2 * turn + 0.4), 190 * np.sin(3 * turn), 250 * np.cos(turn)])
+    path = np.column_stack(
+        [120 * np.sin(2 * turn + 0.4), 190 * np.sin(3 * turn), 250 * np.cos(turn)]
+    )
     return tube(path, 10, up=(1, 0.3, 0.2), closed=True, sides=20)
 
 
 @upright(1.0, (1, 2, 20))
 def tall_column() -> Solid:
     """A fluted column on a square base, 660 mm."""
-    shaft = lathe([(66, 0), (66, 12), (58, 24), (56, 60), (48, 560), (56, 576), (70, 596), (70, 610)], 2)
-    flutes = [rod((60 * x, 60 * y, 64), (52 * x, 52 * y, 548), 8, rounded=True) for x, y in around(16)]
+    shaft = lathe(
+        [(66, 0), (66, 12), (58, 24), (56, 60), (48, 560), (56, 576), (70, 596), (70, 610)], 2
+    )
+    flutes = [
+        rod((60 * x, 60 * y, 64), (52 * x, 52 * y, 548), 8, rounded=True) for x, y in around(16)
+    ]
     ends = [block(150, 150, 30, 3, (0, 0, -14)), block(160, 160, 24, 3, (0, 0, 620))]
     return union(cut(shaft, *flutes), *ends)
 
@@ -121,7 +137,9 @@ def tall_column() -> Solid:
 def gear() -> Solid:
     """A gear of 18 teeth with a hub, six lightening holes and a keyway, 390 mm across."""
     tooth = polygon([(150, -22), (174, -18), (194, -9), (194, 9), (174, 18), (150, 22)])
-    wheel = CrossSection.batch_boolean([disc(160), *(tooth.rotate(20 * k) for k in range(18))], _ADD)
+    wheel = CrossSection.batch_boolean(
+        [disc(160), *(tooth.rotate(20 * k) for k in range(18))], _ADD
+    )
     body = cut(plate(wheel, 56), *(post(-40, 40, 30, at=(98 * x, 98 * y)) for x, y in around(6)))
     hub = lathe([(62, -46), (62, 40), (54, 48)], 1)
     bore = union(post(-80, 80, 26), block(16, 66, 160, 0, (0, 0, 0)))
@@ -134,7 +152,11 @@ def turbine_blade() -> Solid:
     along = np.concatenate([np.linspace(0, 1, 40), np.linspace(1, 0, 40)[1:-1]])
     side = np.concatenate([np.ones(40), -np.ones(38)])
     thickness = 5 * (
-        0.2969 * np.sqrt(along) - 0.126 * along - 0.3516 * along**2 + 0.2843 * along**3 - 0.1036 * along**4
+        0.2969 * np.sqrt(along)
+        - 0.126 * along
+        - 0.3516 * along**2
+        + 0.2843 * along**3
+        - 0.1036 * along**4
     )
     camber = 0.55 * along * (1 - along)
     rings = []
@@ -142,8 +164,14 @@ def turbine_blade() -> Solid:
         chord, turn = 210 - 70 * share, np.radians(30 + 50 * share)
         x, y = (along - 0.4) * chord, (camber + side * thickness * (0.17 - 0.07 * share)) * chord
         level = np.full(len(along), 480 * share)
-        rings.append(np.column_stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y, level]))
-    root = [block(width, 180, 30, 6, (0, 0, -8 - 26 * k)) for k, width in enumerate((230, 205, 180))]
+        rings.append(
+            np.column_stack(
+                [np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y, level]
+            )
+        )
+    root = [
+        block(width, 180, 30, 6, (0, 0, -8 - 26 * k)) for k, width in enumerate((230, 205, 180))
+    ]
     return union(skin(np.array(rings)), *root)
 
 
@@ -195,7 +223,9 @@ def sphere_pair() -> Solid:
     """Two balls that touch, and a third behind them."""
     centres = ((0, -92, -30, 112), (-30, 98, 20, 78), (40, 30, 130, 72))
     rods = [rod(first[:3], second[:3], 22) for first, second in pairwise(centres)]
-    return union(*(Manifold.sphere(radius, 96).translate((x, y, z)) for x, y, z, radius in centres), *rods)
+    return union(
+        *(Manifold.sphere(radius, 96).translate((x, y, z)) for x, y, z, radius in centres), *rods
+    )
 
 
 @upright(1.0, (7, -10, 0))
@@ -222,7 +252,9 @@ def hollow_cube() -> Solid:
 @drawn(1.0, (6, 0, 4))
 def perforated_plate() -> Solid:
     """A bent plate with 42 round holes of growing radius."""
-    holes = [disc(8 + 1.1 * (i + j), (54 * i - 162, 58 * j - 145)) for i in range(7) for j in range(6)]
+    holes = [
+        disc(8 + 1.1 * (i + j), (54 * i - 162, 58 * j - 145)) for i in range(7) for j in range(6)
+    ]
     section = rectangle(400, 360, 20) - CrossSection.batch_boolean(holes, _ADD)
     return _bent(plate(section, 16), lambda x, y: -50 * (x / 200) ** 2)
 
@@ -232,7 +264,9 @@ def torus_knot() -> Solid:
     """A trefoil knot of a bar 56 mm thick."""
     turn = angles(300)
     ring = 118 + 58 * np.cos(3 * turn)
-    path = np.column_stack([85 * np.sin(3 * turn), ring * np.cos(2 * turn), ring * np.sin(2 * turn)])
+    path = np.column_stack(
+        [85 * np.sin(3 * turn), ring * np.cos(2 * turn), ring * np.sin(2 * turn)]
+    )
     return tube(path, 28, up=(1, 0, 0), closed=True, sides=40)
 
 
@@ -241,7 +275,9 @@ def spiral_shell() -> Solid:
     """A horn that winds out of its tip in two and a half turns, each wider."""
     share = np.linspace(0, 1, 150)
     turn, growth = 2 * np.pi * 2.5 * share, 0.16 * 6.25**share
-    path = np.column_stack([190 * growth * np.cos(turn), 190 * growth * np.sin(turn), 330 * (1 - growth)])
+    path = np.column_stack(
+        [190 * growth * np.cos(turn), 190 * growth * np.sin(turn), 330 * (1 - growth)]
+    )
     return tube(path, 84 * growth, sides=48)
 
 
@@ -249,9 +285,16 @@ def spiral_shell() -> Solid:
 def honeycomb() -> Solid:
     """A plate of 31 hexagonal cells, 55 mm deep, closed at the back."""
     cell = CrossSection.circle(36, 6)
-    steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if abs(i + j) <= 3 and not abs(i) == abs(j) == 3]
+    steps = [
+        (i, j)
+        for i in range(-3, 4)
+        for j in range(-3, 4)
+        if abs(i + j) <= 3 and not abs(i) == abs(j) == 3
+    ]
     spots = [(60 * i, 69.282 * (j + i / 2)) for i, j in steps]
-    outline = CrossSection.batch_boolean([CrossSection.circle(47, 6).translate(spot) for spot in spots], _ADD)
+    outline = CrossSection.batch_boolean(
+        [CrossSection.circle(47, 6).translate(spot) for spot in spots], _ADD
+    )
     cells = [cell.extrude(100).translate((*spot, -20)) for spot in spots]
     return cut(plate(outline, 64), *cells)
 
@@ -260,6 +303,8 @@ def _bent(sheet: Solid, height: Callable[[np.ndarray, np.ndarray], np.ndarray]) 
     """A drawn sheet moved towards the viewer by ``height`` (x, y) mm."""
 
     def lift(points: np.ndarray) -> np.ndarray:
-        return points + np.column_stack([np.zeros((len(points), 2)), height(points[:, 0], points[:, 1])])
+        return points + np.column_stack(
+            [np.zeros((len(points), 2)), height(points[:, 0], points[:, 1])]
+        )
 
     return on_grid(sheet).refine_to_length(8).warp_batch(lift)

@@ -1,4 +1,5 @@
-"""Sphinx: the API reference, from the docstrings of the modules. ``sphinx-build -W -b html docs/api build/api``"""
+"""Sphinx: the API reference, from the docstrings of the modules. ``sphinx-build -W -b html docs/api
+build/api``"""
 
 from types import UnionType
 from typing import get_origin
@@ -25,7 +26,9 @@ def _without_substitutions(app, what, name, obj, options, lines) -> None:
 
 def _skipped(app, what, name, obj, skip, options) -> bool | None:
     """Names of types are said where they are used; autodoc can't format them."""
-    foreign = getattr(obj, "__module__", None) == "_thread"  # a lock says of no module that it is imported
+    foreign = (
+        getattr(obj, "__module__", None) == "_thread"
+    )  # a lock says of no module that it is imported
     return True if get_origin(obj) is not None or isinstance(obj, UnionType) or foreign else None
 
 

@@ -1,6 +1,6 @@
-"""Two results of the same samples, sample by sample: the paired difference, its interval, a test, and a sentence.
-Samples that are hard for both methods cancel in the difference. A comparison can therefore tell two methods apart whose
-own intervals overlap."""
+"""Two results of the same samples, sample by sample: the paired difference, its interval, a test,
+and a sentence. Samples that are hard for both methods cancel in the difference. A comparison can
+therefore tell two methods apart whose own intervals overlap."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,13 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import METRICS, OBJECT_KEY, RANK_KEY, RANKED
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Interval, ends
-from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, SIGNIFICANT, caution, object_interval, sign_flip_p
+from fpp_ml_bench.evaluation.score.uncertainty import (
+    FEWEST_OBJECTS,
+    SIGNIFICANT,
+    caution,
+    object_interval,
+    sign_flip_p,
+)
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.schema import Count, Share, StrictModel, Text
 from fpp_ml_bench.style import interval_text, millimetres
@@ -28,8 +34,9 @@ class PairedSample(StrictModel):
 
 
 class Difference(StrictModel):
-    """Mean of second minus first in mm over the ``samples`` that both have, its 95% interval over ``objects``, and the
-    p value of a sign-flip test of the objects' mean differences (null without any).
+    """Mean of second minus first in mm over the ``samples`` that both have, its 95% interval over
+    ``objects``, and the p value of a sign-flip test of the objects' mean differences (null without
+    any).
 
     ``lower`` and ``higher`` count the samples in which the second's error is smaller and larger."""
 
@@ -53,7 +60,8 @@ class Difference(StrictModel):
 
 
 class Comparison(StrictModel):
-    """``second`` against ``first``: a `Difference` for each headline key, and the differences of each sample."""
+    """``second`` against ``first``: a `Difference` for each headline key, and the differences of
+    each sample."""
 
     first: Text
     second: Text
@@ -68,17 +76,25 @@ class Comparison(StrictModel):
 
 
 def compare(first: Result, second: Result) -> Comparison:
-    """The paired comparison of two results. SubmissionError names everything in which their data differ."""
+    """The paired comparison of two results. SubmissionError names everything in which their data
+    differ."""
     _check_same_data(first, second)
     second_rows = {row.sample: row for row in second.per_sample}
-    paired, charged = [], all(result.metrics.two_sided_mae_mm is not None for result in (first, second))
+    paired, charged = (
+        [],
+        all(result.metrics.two_sided_mae_mm is not None for result in (first, second)),
+    )
     keys = [key for key in RANKED if charged or not METRICS[key].charged]
     for row in first.per_sample:
         pairs = {key: (getattr(row, key), getattr(second_rows[row.sample], key)) for key in keys}
-        differences = {key: None if None in pair else pair[1] - pair[0] for key, pair in pairs.items()}
+        differences = {
+            key: None if None in pair else pair[1] - pair[0] for key, pair in pairs.items()
+        }
         paired.append(PairedSample(sample=row.sample, object=row.object, differences=differences))
     owners = [row.object for row in paired]
-    summaries = {key: paired_difference([row.differences[key] for row in paired], owners) for key in keys}
+    summaries = {
+        key: paired_difference([row.differences[key] for row in paired], owners) for key in keys
+    }
     names = printable(first.submission.name), printable(second.submission.name)
     if names[0] == names[1]:
         names = f"{names[0]} (first)", f"{names[1]} (second)"
@@ -103,19 +119,23 @@ def _check_same_data(first: Result, second: Result) -> None:
     for title, key in {**rules, "protocol": "protocol_version"}.items():
         one, other = attrgetter(key)(first), attrgetter(key)(second)
         lines += [f"{title}: {one} against {other}"] if one != other else []
-    samples = [sorted((row.sample, row.object_pixels) for row in result.per_sample) for result in (first, second)]
+    samples = [
+        sorted((row.sample, row.object_pixels) for row in result.per_sample)
+        for result in (first, second)
+    ]
     if samples[0] != samples[1]:
         lines.append("samples: the samples differ")
     if lines:
         raise SubmissionError(
-            "the two results can't be compared, they were not scored on the same data by the same rules; score both "
+            "the two results can't be compared, they were not scored on the same data by the same "
+            "rules; score both "
             "with the same fpp-eval options:\n  " + "\n  ".join(lines)
         )
 
 
 def paired_difference(values: Sequence[float | None], owners: Sequence[str]) -> Difference:
-    """The `Difference` of second minus first in mm, ``values`` by sample, None where a pixel set is empty; ``owners``:
-    the object of each sample."""
+    """The `Difference` of second minus first in mm, ``values`` by sample, None where a pixel set is
+    empty; ``owners``: the object of each sample."""
     differences = [value for value in values if value is not None]
     interval = object_interval(values, owners)
     by_object: dict[str, list[float]] = {}
@@ -125,7 +145,9 @@ def paired_difference(values: Sequence[float | None], owners: Sequence[str]) -> 
     return Difference(
         mean_mm=statistics.fmean(differences) if differences else None,
         interval_mm=[None, None] if interval is None else list(interval),
-        sign_flip_p=sign_flip_p([statistics.fmean(views) for views in by_object.values()]) if by_object else None,
+        sign_flip_p=sign_flip_p([statistics.fmean(views) for views in by_object.values()])
+        if by_object
+        else None,
         samples=len(differences),
         objects=len(by_object),
         lower=sum(value < 0 for value in differences),
@@ -148,17 +170,29 @@ def sentence(first: str, second: str, error: str, difference: Difference) -> str
     if not difference.lower and not difference.higher:
         return f"{second} and {first} have the same {error} in all {difference.samples} {units}."
     size = f"{millimetres(abs(difference.mean_mm))} mm"
-    word, count = ("lower", difference.lower) if difference.mean_mm < 0 else ("higher", difference.higher)
+    word, count = (
+        ("lower", difference.lower) if difference.mean_mm < 0 else ("higher", difference.higher)
+    )
     views = f"{word} in {count} of {difference.samples} {units}"
     if difference.interval is None:
         no_interval = "with one object there is no interval, so nothing can be said beyond it"
-        return f"The {error} of {second} is {size} {word} than that of {first} on average, {views}; {no_interval}."
+        return (
+            f"The {error} of {second} is {size} {word} than that of {first} on average, {views}; "
+            f"{no_interval}."
+        )
     p = 1.0 if difference.sign_flip_p is None else difference.sign_flip_p
-    between = f"{interval_text(difference.interval)} mm over {difference.objects} objects; sign-flip test p = {p:.3g}"
+    between = (
+        f"{interval_text(difference.interval)} mm over {difference.objects} objects; sign-flip "
+        f"test p = {p:.3g}"
+    )
     few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
     if difference.distinguishable and p > SIGNIFICANT:
         level = f"{100 * SIGNIFICANT:.0f}%"
-        reach = f": {difference.objects} objects never reach {level}" if difference.objects < FEWEST_OBJECTS else ""
+        reach = (
+            f": {difference.objects} objects never reach {level}"
+            if difference.objects < FEWEST_OBJECTS
+            else ""
+        )
         few_objects = f" The test does not confirm it at {level}{reach}.{few_objects}"
     if difference.distinguishable:
         by = f"by {size} on average (95% interval {between})"

@@ -1,5 +1,5 @@
-"""What `fpp-eval` prints: a result's pixel sets and samples of largest error, and the comparison of two results. Every
-text from a submission is shown as plain text, never as markup."""
+"""What `fpp-eval` prints: a result's pixel sets and samples of largest error, and the comparison of
+two results. Every text from a submission is shown as plain text, never as markup."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ def result_table(result: Result) -> Group:
     info = result.dataset
     title = Text(
         f"\n{printable(result.submission.name)}\n"
-        f"{info.split} split of {printable(info.name)} ({printable(info.identity)}),\n{info.samples} samples of "
+        f"{info.split} split of {printable(info.name)} "
+        f"({printable(info.identity)}),\n{info.samples} samples of "
         f"{info.size[1]}x{info.size[0]} px, against {result.target}, {result.track} track"
         f"{'' if result.mode == 'standard' else f', mode {result.mode}'}\n"
     )
@@ -54,7 +55,9 @@ def _scores(result: Result) -> Table:
     table = _table(
         "Pixel set",
         numbers=[f"{error.upper()}\n{value}" for error in errors for value in values],
-        first_out=[f"{error.upper()}\n{value}" for value in reversed(values) for error in reversed(errors)],
+        first_out=[
+            f"{error.upper()}\n{value}" for value in reversed(values) for error in reversed(errors)
+        ],
         caption="mm; mean and median over samples, pooled over all pixels; 95% intervals of the means from a bootstrap "
         f"over {objects} {'object' if objects == 1 else 'objects'}",
     )
@@ -66,7 +69,9 @@ def _scores(result: Result) -> Table:
     for pixels, title in titles.items():
         cells = []
         for key in (f"{pixels}_{error}_mm" for error in errors):
-            mean, median = (millimetres(getattr(part, key)) for part in (result.metrics, result.median))
+            mean, median = (
+                millimetres(getattr(part, key)) for part in (result.metrics, result.median)
+            )
             interval = interval_text(result.intervals.of(key), "..") if pixels in PIXEL_SETS else ""
             pooled = millimetres(getattr(result.pooled, key)) if pixels in PIXEL_SETS else ""
             cells += [mean, interval, median, pooled]
@@ -83,19 +88,35 @@ def _notes(result: Result) -> Text:
         if not (METRICS[first].optional and getattr(scores, first) is None):
             lines.append(note.format_map(texts))
     if result.samples_without_object:
-        lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")
+        lines.append(
+            f"{result.samples_without_object} samples without an object: left out of the object "
+            f"scores."
+        )
     if result.samples_without_background:
-        lines.append(f"{result.samples_without_background} samples without background: left out of its scores.")
+        lines.append(
+            f"{result.samples_without_background} samples without background: left out of its "
+            f"scores."
+        )
     if submission.uses_ground_truth_range:
-        lines.append("Oracle range: the method was given depth_min and depth_max of the scored samples.")
+        lines.append(
+            "Oracle range: the method was given depth_min and depth_max of the scored samples."
+        )
     if submission.uses_ground_truth_mask:
-        lines.append("Oracle mask: the method was given which pixels of the scored samples are object.")
+        lines.append(
+            "Oracle mask: the method was given which pixels of the scored samples are object."
+        )
     if submission.uses_ground_truth_order:
-        lines.append("Oracle order: the method was given the true fringe orders of the scored samples.")
+        lines.append(
+            "Oracle order: the method was given the true fringe orders of the scored samples."
+        )
     if few_objects := caution(len(result.per_object)):
         lines.append(few_objects)
     known = submission.seconds_per_sample is not None
-    time = f"{three_digits(submission.seconds_per_sample)} s ({submission.seconds_source})" if known else "unknown time"
+    time = (
+        f"{three_digits(submission.seconds_per_sample)} s ({submission.seconds_source})"
+        if known
+        else "unknown time"
+    )
     lines.append(f"Frames used: {len(submission.frames_used)}; {time} per sample.")
     return Text("\n".join(lines) + "\n")
 
@@ -107,12 +128,21 @@ def _uncertainty(result: Result) -> Table | None:
     table = _table(
         "Stated uncertainty",
         numbers=[metric.terminal for metric in shown],
-        first_out=["Sigma\nmedian", "NLL", "In 99%\ninterval", "RMSE of the\nsurest 95%", "MAE of the\nsurest 95%"],
+        first_out=[
+            "Sigma\nmedian",
+            "NLL",
+            "In 99%\ninterval",
+            "RMSE of the\nsurest 95%",
+            "MAE of the\nsurest 95%",
+        ],
         caption="mm; of the pixels that state a sigma, those within its Gaussian intervals, means over samples; AUSE: "
-        "area between the sparsification curves by sigma and by error; missed and invented pixels are charged",
+        "area between the sparsification curves by sigma and by error; missed and invented pixels "
+        "are charged",
     )
     for name, scores in {"all": block.metrics, **block.per_object}.items():
-        table.add_row(Text(printable(name)), *_cells(scores, shown), style="bold" if name == "all" else None)
+        table.add_row(
+            Text(printable(name)), *_cells(scores, shown), style="bold" if name == "all" else None
+        )
     return table
 
 
@@ -137,8 +167,19 @@ def _worst(result: Result) -> Table | None:
 
 def comparison_table(compared: Comparison) -> Group:
     """The comparison as rich tables."""
-    titles = ["Second - first", "95% interval", "p", "Second lower in", "Second higher in", "Samples", "Objects"]
-    about = "mm; mean of second - first over samples, 95% interval and p value of a sign-flip test over objects"
+    titles = [
+        "Second - first",
+        "95% interval",
+        "p",
+        "Second lower in",
+        "Second higher in",
+        "Samples",
+        "Objects",
+    ]
+    about = (
+        "mm; mean of second - first over samples, 95% interval and p value of a sign-flip test "
+        "over objects"
+    )
     table = _table("Error", numbers=titles, caption=about)
     for key, row in compared.differences.items():
         pixels, error = key.removesuffix("_mm").rsplit("_", 1)
@@ -150,7 +191,9 @@ def comparison_table(compared: Comparison) -> Group:
             interval_text(row.interval, ".."),
             p,
             *map(str, counts),
-            style="bold" if row.distinguishable and (row.sign_flip_p or 1.0) <= SIGNIFICANT else None,
+            style="bold"
+            if row.distinguishable and (row.sign_flip_p or 1.0) <= SIGNIFICANT
+            else None,
         )
     title = Text(
         f"\nfirst:  {printable(compared.first)}\nsecond: {printable(compared.second)}\n"

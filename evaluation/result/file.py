@@ -1,4 +1,5 @@
-"""Result files on disk: written whole, read strictly; what they say of code and machine; JSON Schemas."""
+"""Result files on disk: written whole, read strictly; what they say of code and machine; JSON
+Schemas."""
 
 import hashlib
 import json
@@ -13,7 +14,12 @@ import pydantic
 
 from fpp_ml_bench import __version__, depth
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import MOST_OBJECTS, MOST_SAMPLES, RESULT_SCHEMA_VERSION, SchemaVersion
+from fpp_ml_bench.evaluation.protocol import (
+    MOST_OBJECTS,
+    MOST_SAMPLES,
+    RESULT_SCHEMA_VERSION,
+    SchemaVersion,
+)
 from fpp_ml_bench.evaluation.report.comparison import Comparison
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Environment, HardwareInfo
@@ -41,7 +47,9 @@ def result_content(result: Result) -> dict[str, Any]:
 
 
 def _json_bytes(content: Any) -> bytes:
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n"
+    return (
+        json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n"
+    )
 
 
 def result_json(result: Result) -> bytes:
@@ -60,13 +68,16 @@ def write_json(content: Any, path: Path) -> None:
 
 
 def write_file(content: bytes, path: Path, new_folder: bool = False) -> None:
-    """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
+    """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where
+    it can't be."""
     try:
         if new_folder:
             path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, content)
     except OSError as error:
-        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
+        raise SubmissionError(
+            f"{printable(str(path), 500)} can't be written: {error.strerror}"
+        ) from None
 
 
 def read_result(path: Path) -> Result:
@@ -75,7 +86,8 @@ def read_result(path: Path) -> Result:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file that `fpp-eval` may have written; SubmissionError names file and problem."""
+    """The content of a JSON file that `fpp-eval` may have written; SubmissionError names file and
+    problem."""
     return read_strict_json(path, SubmissionError, "write it again with fpp-eval --json")
 
 
@@ -85,23 +97,38 @@ def parse_result(content: Any, path: Path) -> Result:
     keys = content if isinstance(content, dict) else {}
     for key, what in _OTHER_FILES.items():
         if key in keys:
-            raise SubmissionError(f"{file} is not a result file but {what}; expected what fpp-eval --json writes")
+            raise SubmissionError(
+                f"{file} is not a result file but {what}; expected what fpp-eval --json writes"
+            )
     version = keys.get("schema_version")
     if version not in get_args(SchemaVersion):
-        given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
-        expected = f"expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}"
-        raise SubmissionError(f"{file}: {expected}; score the predictions again with this version's fpp-eval")
+        given = (
+            "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
+        )
+        expected = (
+            f"expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, "
+            f"got {given}"
+        )
+        raise SubmissionError(
+            f"{file}: {expected}; score the predictions again with this version's fpp-eval"
+        )
     rows = keys.get("per_sample")
-    owners = [str(row.get("object")) for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    owners = (
+        [str(row.get("object")) for row in rows if isinstance(row, dict)]
+        if isinstance(rows, list)
+        else []
+    )
     if len(set(owners)) > MOST_OBJECTS or len(owners) > MOST_SAMPLES:
         expected = f"expected at most {MOST_OBJECTS} objects and {MOST_SAMPLES} samples"
-        raise SubmissionError(f"{file}: {expected}, got {len(set(owners))} and {len(owners)}; score parts of the data")
+        raise SubmissionError(
+            f"{file}: {expected}, got {len(set(owners))} and {len(owners)}; score parts of the data"
+        )
     return validate(Result, content, path, "result of fpp-eval")
 
 
 def json_schema(name: str) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``. It lists the keys and what each may
-    hold. Whether averages follow from the samples is checked on reading."""
+    """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``. It lists the
+    keys and what each may hold. Whether averages follow from the samples is checked on reading."""
     models: dict[str, type[pydantic.BaseModel]] = {
         "result": Result,
         "submission": Submission,
@@ -124,7 +151,10 @@ def environment() -> Environment:
     modules = {"numpy": np, "pyarrow": pyarrow, "pydantic": pydantic}
     return Environment(
         python=platform.python_version(),
-        packages={"fpp_ml_bench": __version__, **{name: module.__version__ for name, module in modules.items()}},
+        packages={
+            "fpp_ml_bench": __version__,
+            **{name: module.__version__ for name, module in modules.items()},
+        },
         git=_commit(),
         code_sha256=_scoring_code(),
         hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),

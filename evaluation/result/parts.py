@@ -1,5 +1,5 @@
-"""The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time, phase reliance,
-robustness, a stated uncertainty."""
+"""The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time,
+phase reliance, robustness, a stated uncertainty."""
 
 import json
 import math
@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from fpp_ml_bench.evaluation.metrics import BOUNDS, HEADLINE, METRICS, MIXTURES, RANKED, UNCERTAINTY, Metric
+from fpp_ml_bench.evaluation.metrics import (
+    BOUNDS,
+    HEADLINE,
+    METRICS,
+    MIXTURES,
+    RANKED,
+    UNCERTAINTY,
+    Metric,
+)
 from fpp_ml_bench.evaluation.protocol import LEFT_OUT, NOMINAL, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
 from fpp_ml_bench.files import LARGEST
@@ -20,7 +28,8 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Whole = Annotated[int, Field(gt=0)]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 Charge = Annotated[float, Field(gt=0)] | None
-"""What a missing or invented pixel costs in the two-sided scores, mm; None by rules without them."""
+"""What a missing or invented pixel costs in the two-sided scores, mm; None by rules without
+them."""
 AGREES = 1e-9
 """Relative difference up to which two computations of an average count as the same number."""
 LEAST = 1e-300
@@ -42,11 +51,12 @@ def can_mix(
     power: int,
     rounding: float,
 ) -> bool:
-    """Whether ``whole`` can be the mean over views of the error of a set, where those of its two parts have the means
-    ``first`` (at least, at most) and ``second``, and no view has more than the shares ``most`` of its pixels in them;
-    ``power``: 1 for MAE, 2 for RMSE."""
+    """Whether ``whole`` can be the mean over views of the error of a set, where those of its two
+    parts have the means ``first`` (at least, at most) and ``second``, and no view has more than the
+    shares ``most`` of its pixels in them; ``power``: 1 for MAE, 2 for RMSE."""
     of_first, of_second = (min(share, 1.0) for share in most)
-    # The error of a view is a norm of its parts: its mean is at least the norm of their means, and at most their sum.
+    # The error of a view is a norm of its parts: its mean is at least the norm of their means, and
+    # at most their sum.
     least = ((1 - of_second) * first[0] ** power + (1 - of_first) * second**power) ** (1 / power)
     largest = of_first ** (1 / power) * first[1] + of_second ** (1 / power) * second
     return not exceeds(least, whole, rounding) and not exceeds(whole, largest, rounding)
@@ -71,7 +81,10 @@ _TYPES: dict[str, Any] = {
 def _fields(metrics: Iterable[Metric]) -> dict[str, Any]:
     """A field for each metric, as the annotations of a model."""
     types = ((metric, _TYPES[metric.unit]) for metric in metrics)
-    return {metric.key: Annotated[kind, Field(default=None)] if metric.optional else kind for metric, kind in types}
+    return {
+        metric.key: Annotated[kind, Field(default=None)] if metric.optional else kind
+        for metric, kind in types
+    }
 
 
 class Scores(StrictModel):
@@ -89,39 +102,62 @@ class Headline(Scores):
 
 
 class Metrics(Headline, SparseModel):
-    """All scores: errors in mm, shares of pixels. PROTOCOL.md defines each. Those that may be null by default are not
-    written where there are none: no unlit pixels are scored, or the rules know no void."""
+    """All scores: errors in mm, shares of pixels. PROTOCOL.md defines each. Those that may be null
+    by default are not written where there are none: no unlit pixels are scored, or the rules know
+    no void."""
 
     SPARSE = OPTIONAL
     __annotations__ = _fields(METRICS[key] for key in METRICS if key not in HEADLINE)
 
     def problem(self, views: int, rounding: float, charge_mm: float | None = None) -> str | None:
-        """Why no errors have these scores, which are means over at most ``views`` samples, each with an error of
-        ``rounding`` times itself; None where some have. ``charge_mm``: that of the two-sided scores."""
+        """Why no errors have these scores, which are means over at most ``views`` samples, each
+        with an error of ``rounding`` times itself; None where some have. ``charge_mm``: that of the
+        two-sided scores."""
         for key, metric in METRICS.items():
-            if metric.over and (getattr(self, key) is None) != (getattr(self, f"{metric.over}_mae_mm") is None):
-                return f"{metric.over} scores must be null exactly when the set is empty, and then null all together"
-        return next(self._contradictions(views, rounding), None) or self._charged_otherwise(rounding, charge_mm)
+            if metric.over and (getattr(self, key) is None) != (
+                getattr(self, f"{metric.over}_mae_mm") is None
+            ):
+                return (
+                    f"{metric.over} scores must be null exactly when the set is empty, and then "
+                    f"null all together"
+                )
+        return next(self._contradictions(views, rounding), None) or self._charged_otherwise(
+            rounding, charge_mm
+        )
 
     def _charged_otherwise(self, rounding: float, charge_mm: float | None) -> str | None:
-        """What of the two-sided scores does not follow from the errors and the charge. Without the charges, which are
-        the same for means, they are errors of measured pixels: less than those of all, whatever was missing."""
+        """What of the two-sided scores does not follow from the errors and the charge. Without the
+        charges, which are the same for means, they are errors of measured pixels: less than those
+        of all, whatever was missing."""
         charged = [getattr(self, key) for key, metric in METRICS.items() if metric.charged]
         known = charge_mm is not None and self.object_mae_mm is not None
         if any((score is None) == known for score in charged):
-            return f"the two-sided scores must be there exactly where there is a charge, which is {charge_mm} mm"
+            return (
+                f"the two-sided scores must be there exactly where there is a charge, which is "
+                f"{charge_mm} mm"
+            )
         if charge_mm is None or self.object_mae_mm is None:
             return None
         charge = charge_mm * (self.object_missing_share + self.invented_share)
-        measured, slack = self.two_sided_mae_mm - charge, 2 * rounding * (self.two_sided_mae_mm + charge) + LEAST
+        measured, slack = (
+            self.two_sided_mae_mm - charge,
+            2 * rounding * (self.two_sided_mae_mm + charge) + LEAST,
+        )
         if measured < -slack or measured > self.object_mae_mm + slack:
-            return "two_sided_mae_mm does not follow from the charge, the missing and the invented pixels"
+            return (
+                "two_sided_mae_mm does not follow from the charge, the missing and the invented "
+                "pixels"
+            )
         return None
 
     def _contradictions(self, views: int, rounding: float) -> Iterator[str]:
         known = {key: abs(value) for key in METRICS if (value := getattr(self, key)) is not None}
         for key, bound, factor, why in BOUNDS:
-            if key in known and bound in known and exceeds(known[key], factor * known[bound], rounding):
+            if (
+                key in known
+                and bound in known
+                and exceeds(known[key], factor * known[bound], rounding)
+            ):
                 yield why
         last_digit = rounding / 10  # of a share near 1
         for key, first, second, share in MIXTURES:
@@ -130,11 +166,15 @@ class Metrics(Headline, SparseModel):
                 unknown = known["object_max_mm"] if key == "object_mae_mm" else LARGEST
                 low, high = (known.get(first, 0.0),) * 2 if first else (0.0, unknown)
                 power = 2 if "rmse" in key else 1
-                if not can_mix(known[key], (low, high), known.get(second, 0.0), shares, power, rounding):
+                if not can_mix(
+                    known[key], (low, high), known.get(second, 0.0), shares, power, rounding
+                ):
                     yield f"{key} does not follow from those of its parts and {share}"
         if self.object_mae_mm is None:
             return
-        mae, rmse, median, p95, largest = (known[f"object_{k}_mm"] for k in ("mae", "rmse", "median", "p95", "max"))
+        mae, rmse, median, p95, largest = (
+            known[f"object_{k}_mm"] for k in ("mae", "rmse", "median", "p95", "max")
+        )
         if exceeds(mae, 0.5 * median + 0.45 * p95 + 0.05 * largest, rounding):
             yield "object MAE is above what median, 95th percentile and maximum allow"
         if exceeds(rmse, math.sqrt(mae) * math.sqrt(largest), rounding):
@@ -142,14 +182,21 @@ class Metrics(Headline, SparseModel):
         for limit in WITHIN_MM:
             beyond = 1 - known[f"object_within_{limit}mm_share"]
             most = views * (beyond + last_digit) * largest
-            pairs = (limit * (beyond - last_digit), mae), (mae, limit + most), (median, limit + 2 * most)
-            if any(exceeds(less, more, rounding) for less, more in (*pairs, (p95, limit + 20 * most))):
+            pairs = (
+                (limit * (beyond - last_digit), mae),
+                (mae, limit + most),
+                (median, limit + 2 * most),
+            )
+            if any(
+                exceeds(less, more, rounding) for less, more in (*pairs, (p95, limit + 20 * most))
+            ):
                 yield f"object_within_{limit}mm_share contradicts the errors"
 
 
 class SampleResult(Metrics):
-    """Scores of one sample, how many pixels each set has, and the hash of the prediction file they come from.
-    ``void_pixels`` is absent by rules without void, ``unlit_pixels`` where the unlit ones are not scored."""
+    """Scores of one sample, how many pixels each set has, and the hash of the prediction file they
+    come from. ``void_pixels`` is absent by rules without void, ``unlit_pixels`` where the unlit
+    ones are not scored."""
 
     SPARSE = (*OPTIONAL, "void_pixels", "unlit_pixels")
 
@@ -164,11 +211,14 @@ class SampleResult(Metrics):
     def stats(self, pixels: str) -> ErrorStats:
         """Errors of the ``object`` or the ``background`` set."""
         count = getattr(self, f"{pixels}_pixels")
-        return ErrorStats(count, getattr(self, f"{pixels}_mae_mm"), getattr(self, f"{pixels}_rmse_mm"))
+        return ErrorStats(
+            count, getattr(self, f"{pixels}_mae_mm"), getattr(self, f"{pixels}_rmse_mm")
+        )
 
 
 class ObjectResult(StrictModel):
-    """An object: mean and spread (sample standard deviation, n - 1) of every metric over its views."""
+    """An object: mean and spread (sample standard deviation, n - 1) of every metric over its
+    views."""
 
     object: Text
     samples: Whole
@@ -177,8 +227,8 @@ class ObjectResult(StrictModel):
 
 
 class Intervals(Scores, SparseModel):
-    """Ends of the 95% interval of the means of `RANKED` in mm, from a bootstrap over objects; nulls below two
-    objects."""
+    """Ends of the 95% interval of the means of `RANKED` in mm, from a bootstrap over objects; nulls
+    below two objects."""
 
     SPARSE = tuple(key for key in RANKED if METRICS[key].optional)
     __annotations__ = dict.fromkeys(HEADLINE, Interval) | dict.fromkeys(
@@ -186,7 +236,8 @@ class Intervals(Scores, SparseModel):
     )
 
     def of(self, key: str) -> tuple[float, float] | None:
-        """The interval of ``key``; None where there is none (no key of `RANKED`, no such score, or too few objects)."""
+        """The interval of ``key``; None where there is none (no key of `RANKED`, no such score, or
+        too few objects)."""
         return ends(getattr(self, key, None) or (None, None))
 
 
@@ -200,7 +251,8 @@ class Bootstrap(StrictModel):
 
 
 class BenchmarkInfo(StrictModel):
-    """Name and version of a benchmark; `fpp_ml_bench.loaders.storage.benchmark` lists those that this package knows."""
+    """Name and version of a benchmark; `fpp_ml_bench.loaders.storage.benchmark` lists those that
+    this package knows."""
 
     name: Text
     version: Count
@@ -213,12 +265,13 @@ Content = dict[
 
 
 class DatasetInfo(SparseModel):
-    """The data that was scored on; ``name`` is only the folder's name. ``content``: hashes of the decoded values that
-    the scores depend on, by ``split/column`` (`fpp_ml_bench.loaders.storage.benchmark`). ``code``: what the projector
-    showed, ``phase shift``, ``crossed`` or ``Gray code``.
+    """The data that was scored on; ``name`` is only the folder's name. ``content``: hashes of the
+    decoded values that the scores depend on, by ``split/column``
+    (`fpp_ml_bench.loaders.storage.benchmark`). ``code``: what the projector showed, ``phase
+    shift``, ``crossed`` or ``Gray code``.
 
-    ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version whose content is another
-    one is refused."""
+    ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version
+    whose content is another one is refused."""
 
     SPARSE = ("benchmark",)
 
@@ -247,13 +300,14 @@ class DatasetInfo(SparseModel):
 
     @property
     def truth(self) -> str:
-        """What two results share that were scored on the same scenes, whatever was projected: a hash over ``content``,
-        32 hex digits."""
+        """What two results share that were scored on the same scenes, whatever was projected: a
+        hash over ``content``, 32 hex digits."""
         return sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()[:32]
 
     @property
     def identity(self) -> str:
-        """What identifies the data, for people: name and version of the benchmark, and the start of `truth`."""
+        """What identifies the data, for people: name and version of the benchmark, and the start of
+        `truth`."""
         named, benchmark = "no named benchmark", self.benchmark
         if benchmark is not None:
             named = f"{benchmark.name} version {benchmark.version}"
@@ -271,10 +325,12 @@ class HardwareInfo(StrictModel):
 
 
 class Environment(StrictModel):
-    """Where and with what the scores were computed (not where the predictions were made: see ``submission``).
+    """Where and with what the scores were computed (not where the predictions were made: see
+    ``submission``).
 
-    ``git`` is the commit of the checkout this package ran from, null for an installed package. ``code_sha256`` covers
-    the source of the scoring, so an edited checkout differs from its commit."""
+    ``git`` is the commit of the checkout this package ran from, null for an installed package.
+    ``code_sha256`` covers the source of the scoring, so an edited checkout differs from its
+    commit."""
 
     python: Text
     packages: dict[Text, Text] = Field(max_length=100)
@@ -286,11 +342,12 @@ class Environment(StrictModel):
 class Timing(StrictModel):
     """How long a method takes on images of ``image_size`` (H, W) px, and what it needs.
 
-    Latency is that of one image at batch 1 after warm-up, frames in memory: the median, 5th and 95th percentile over
-    ``repeats`` runs, in ms. Throughput is in images per second with ``batch`` images at once (``batched`` says whether
-    the method takes them together or one after another). ``peak_memory_mib`` is the largest resident set of the whole
-    process, ``working_memory_mib`` what predicting one image adds to it, ``gpu_memory_mib`` the most that was allocated
-    on the GPU; null where unknown. ``frames`` is the number of captures that one depth map costs."""
+    Latency is that of one image at batch 1 after warm-up, frames in memory: the median, 5th and
+    95th percentile over ``repeats`` runs, in ms. Throughput is in images per second with ``batch``
+    images at once (``batched`` says whether the method takes them together or one after another).
+    ``peak_memory_mib`` is the largest resident set of the whole process, ``working_memory_mib``
+    what predicting one image adds to it, ``gpu_memory_mib`` the most that was allocated on the GPU;
+    null where unknown. ``frames`` is the number of captures that one depth map costs."""
 
     provenance: Literal["measured", "self-reported"]
     latency_median_ms: Positive
@@ -319,44 +376,62 @@ class Timing(StrictModel):
 
 RelianceVersion = Literal["1.0.0"]
 RELIANCE_VERSION: RelianceVersion = "1.0.0"
-"""Version of the score's definition and of the scenes; scores of different versions are not compared."""
+"""Version of the score's definition and of the scenes; scores of different versions are not
+compared."""
 
 
 class RelianceParts(StrictModel):
-    """The parts of the score, and further measurements; means over samples, null where a part can't be measured.
+    """The parts of the score, and further measurements; means over samples, null where a part can't
+    be measured.
 
-    ``follows_*``: how far the answer follows, in [0, 1], when a surface moves within its outline. ``phase``: only the
-    phase is that of the moved surface, every pixel keeps its brightness (part of the score). ``light``: only the
-    brightness is. ``both``: both, as a camera would see it. ``constant``: the phase alone, moved by a constant.
-    ``change_*``: how much the answer changes, relative to the change that the phase asks for: with another outline
-    (part of the score), without fringes inside or outside the object, with fringes of the other direction or of
-    another pitch. ``answered_*``: share of the object's pixels that have an answer in that case. ``order_free_*``:
-    the same, allowing whole periods."""
+    ``follows_*``: how far the answer follows, in [0, 1], when a surface moves within its outline.
+    ``phase``: only the phase is that of the moved surface, every pixel keeps its brightness (part
+    of the score). ``light``: only the brightness is. ``both``: both, as a camera would see it.
+    ``constant``: the phase alone, moved by a constant. ``change_*``: how much the answer changes,
+    relative to the change that the phase asks for: with another outline (part of the score),
+    without fringes inside or outside the object, with fringes of the other direction or of another
+    pitch. ``answered_*``: share of the object's pixels that have an answer in that case.
+    ``order_free_*``: the same, allowing whole periods."""
 
-    follows_phase: Annotated[Share | None, "follows the phase, within the object, brightness unchanged"]
+    follows_phase: Annotated[
+        Share | None, "follows the phase, within the object, brightness unchanged"
+    ]
     follows_light: Annotated[Share | None, "follows the brightness, phase unchanged"]
     follows_both: Annotated[Share | None, "follows a moved surface as it would be photographed"]
     follows_constant: Annotated[Share | None, "follows the phase when all of the object moves"]
     change_outline: Annotated[NonNegative | None, "changes with another outline"]
-    change_no_fringe_inside: Annotated[NonNegative | None, "changes without fringes inside the object"]
-    change_no_fringe_outside: Annotated[NonNegative | None, "changes without fringes outside the object"]
-    change_other_direction: Annotated[NonNegative | None, "changes with fringes of the other direction"]
+    change_no_fringe_inside: Annotated[
+        NonNegative | None, "changes without fringes inside the object"
+    ]
+    change_no_fringe_outside: Annotated[
+        NonNegative | None, "changes without fringes outside the object"
+    ]
+    change_other_direction: Annotated[
+        NonNegative | None, "changes with fringes of the other direction"
+    ]
     change_other_pitch: Annotated[NonNegative | None, "changes with fringes of another pitch"]
     answered_no_fringe_inside: Annotated[Share | None, "share answered without fringes inside"]
     answered_no_fringe_outside: Annotated[Share | None, "share answered without fringes outside"]
     order_free_follows_phase: Annotated[Share | None, "follows the phase, without whole periods"]
-    order_free_change_outline: Annotated[NonNegative | None, "changes with another outline, without whole periods"]
+    order_free_change_outline: Annotated[
+        NonNegative | None, "changes with another outline, without whole periods"
+    ]
 
     def titled(self) -> dict[str, float | None]:
         """Each part by what it is in words."""
-        return {str(field.metadata[0]): getattr(self, name) for name, field in type(self).model_fields.items()}
+        return {
+            str(field.metadata[0]): getattr(self, name)
+            for name, field in type(self).model_fields.items()
+        }
 
 
 class Reliance(StrictModel):
-    """The phase-reliance score in [0, 1] with its 95% interval (bootstrap over objects; nulls below two objects).
+    """The phase-reliance score in [0, 1] with its 95% interval (bootstrap over objects; nulls below
+    two objects).
 
-    ``order_free_score`` allows whole periods and is null where the answer is not in mm. ``units`` are those of the
-    answer that was held against the truth; ``weights_sha256`` of a network is that of its weights file."""
+    ``order_free_score`` allows whole periods and is null where the answer is not in mm. ``units``
+    are those of the answer that was held against the truth; ``weights_sha256`` of a network is that
+    of its weights file."""
 
     version: RelianceVersion
     score: Share
@@ -378,11 +453,12 @@ class Reliance(StrictModel):
 
 
 class SeverityScores(StrictModel):
-    """Means over the views of a severity. ``mae_mm`` is the protocol's two-sided MAE, ``answered_mae_mm`` that of the
-    object's pixels with an answer. Shares of the scored pixels: of wrong orders, of pixels without an answer, of
-    confident errors and of pixels that state a sigma (null both where a method states none); ``invented_share`` is
-    background with an answer, over the scored pixels. ``sure_mae_mm`` and ``sure_rmse_mm`` are of the surest 95%, as in
-    the protocol; null where the method states no sigma."""
+    """Means over the views of a severity. ``mae_mm`` is the protocol's two-sided MAE,
+    ``answered_mae_mm`` that of the object's pixels with an answer. Shares of the scored pixels: of
+    wrong orders, of pixels without an answer, of confident errors and of pixels that state a sigma
+    (null both where a method states none); ``invented_share`` is background with an answer, over
+    the scored pixels. ``sure_mae_mm`` and ``sure_rmse_mm`` are of the surest 95%, as in the
+    protocol; null where the method states no sigma."""
 
     mae_mm: NonNegative
     wrong_share: Share
@@ -400,10 +476,11 @@ FiveSeverities = Annotated[list[SeverityScores], Field(min_length=5, max_length=
 
 
 class Robustness(StrictModel):
-    """What disturbed scenes do to a method: ``mae_mm`` is the mean over ``axes`` and their five severities, with its
-    95% interval (bootstrap over objects; nulls below two objects); ``clean`` is the undisturbed scene. ``beside``: axes
-    that do not count in the mean. ``drawn``: those that the training's lights disturbed too. ``version`` is that of the
-    axes; before 4 a missed pixel cost less and an invented one nothing."""
+    """What disturbed scenes do to a method: ``mae_mm`` is the mean over ``axes`` and their five
+    severities, with its 95% interval (bootstrap over objects; nulls below two objects); ``clean``
+    is the undisturbed scene. ``beside``: axes that do not count in the mean. ``drawn``: those that
+    the training's lights disturbed too. ``version`` is that of the axes; before 4 a missed pixel
+    cost less and an invented one nothing."""
 
     version: AxesVersion
     set: Literal["test", "unseen"]
@@ -436,25 +513,30 @@ class Robustness(StrictModel):
         return self
 
 
-def check_measured(interval: Sequence[float | None], samples: int, objects: int, most: float = math.inf) -> None:
+def check_measured(
+    interval: Sequence[float | None], samples: int, objects: int, most: float = math.inf
+) -> None:
     """Refuse (ValueError) an interval that is none, and more objects than samples."""
     if interval.count(None) == 1:
         raise ValueError("interval: expected two numbers or two nulls")
     if (pair := ends(interval)) and not 0 <= pair[0] <= pair[1] <= most:
-        raise ValueError(f"interval: expected 0 <= low <= high{'' if most == math.inf else f' <= {most:g}'}")
+        raise ValueError(
+            f"interval: expected 0 <= low <= high{'' if most == math.inf else f' <= {most:g}'}"
+        )
     if objects > samples:
         raise ValueError("objects is above samples")
 
 
 class SigmaScores(Scores):
-    """Scores of a stated uncertainty; null where no object pixel states one, or where there is no object. The rules are
-    in PROTOCOL.md."""
+    """Scores of a stated uncertainty; null where no object pixel states one, or where there is no
+    object. The rules are in PROTOCOL.md."""
 
     __annotations__ = _fields(UNCERTAINTY.values())
 
 
 class Reliability(StrictModel):
-    """``observed``: mean over samples of the share of pixels within the interval that should hold ``nominal``."""
+    """``observed``: mean over samples of the share of pixels within the interval that should hold
+    ``nominal``."""
 
     nominal: list[Share]
     observed: Annotated[list[Share], Field(min_length=len(NOMINAL), max_length=len(NOMINAL))]
@@ -464,8 +546,8 @@ _Curve = Annotated[list[NonNegative], Field(min_length=len(LEFT_OUT), max_length
 
 
 class Sparsification(StrictModel):
-    """Means over samples of the errors in mm of the object pixels that remain after the share ``left_out``: the least
-    sure by sigma, and for ``best_*`` the worst by their error."""
+    """Means over samples of the errors in mm of the object pixels that remain after the share
+    ``left_out``: the least sure by sigma, and for ``best_*`` the worst by their error."""
 
     left_out: list[Share]
     mae_mm: _Curve
@@ -475,7 +557,8 @@ class Sparsification(StrictModel):
 
 
 class Uncertainty(StrictModel):
-    """``metrics`` is the mean over the samples that have a score, ``per_object`` over the views of each object."""
+    """``metrics`` is the mean over the samples that have a score, ``per_object`` over the views of
+    each object."""
 
     metrics: SigmaScores
     per_object: dict[Text, SigmaScores] = Field(max_length=100_000)

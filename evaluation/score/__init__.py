@@ -1,1 +1,2 @@
-"""Scores in mm: error statistics, pixel sets, units, intervals, and scoring a folder of predictions."""
+"""Scores in mm: error statistics, pixel sets, units, intervals, and scoring a folder of
+predictions."""

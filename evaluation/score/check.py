@@ -1,5 +1,6 @@
-"""Checks of what a submission declares: its units, from which depth becomes the mm that are scored, and all that can be
-checked without ground truth: its description, its files, their size and values."""
+"""Checks of what a submission declares: its units, from which depth becomes the mm that are scored,
+and all that can be checked without ground truth: its description, its files, their size and
+values."""
 
 from __future__ import annotations
 
@@ -46,13 +47,15 @@ Depth = NDArray[np.floating[Any]]
 
 
 def declared_units(target_max: float, units: str | None) -> Units:
-    """The units of arrays, which know no rig: ``mm``, unless ``units`` says ``m``. Raises PredictionError for other
-    units, and where they are not said and the largest depth of a target, ``target_max``, could as well be metres."""
+    """The units of arrays, which know no rig: ``mm``, unless ``units`` says ``m``. Raises
+    PredictionError for other units, and where they are not said and the largest depth of a target,
+    ``target_max``, could as well be metres."""
     if units not in (None, "mm", "m"):
         raise PredictionError(f"units: expected mm or m, got {printable(str(units))}")
     if units is None and 0 < target_max < protocol.METRES_BELOW:
         raise PredictionError(
-            f"targets: the largest depth is {target_max:.4g}, which could be metres; say units='m', or units='mm' "
+            f"targets: the largest depth is {target_max:.4g}, which could be metres; say "
+            f"units='m', or units='mm' "
             f"where depths below {protocol.METRES_BELOW:g} mm are meant"
         )
     return "m" if units == "m" else "mm"
@@ -64,45 +67,62 @@ def in_mm(values: Any, units: Units) -> Any:
 
 
 def value_problems(
-    prediction: Depth, target_mm: Depth, reach_mm: float, units: Units, void: NDArray[np.bool_] | None = None
+    prediction: Depth,
+    target_mm: Depth,
+    reach_mm: float,
+    units: Units,
+    void: NDArray[np.bool_] | None = None,
 ) -> list[str]:
-    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``reach_mm``: up to
-    which depth there is something to measure, the far end of the rig's working range, or the largest target; 0 where
-    that is not known. Pixels in ``void`` may hold any depth."""
+    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list.
+    ``reach_mm``: up to which depth there is something to measure, the far end of the rig's working
+    range, or the largest target; 0 where that is not known. Pixels in ``void`` may hold any
+    depth."""
     low, high = extremes(prediction)
     problems = []
     if not np.isfinite([low, high]).all():  # min and max carry NaN through
         nans, infinities = int(np.isnan(prediction).sum()), int(np.isinf(prediction).sum())
         counts = [f"{n} {word}" for n, word in ((nans, "NaN"), (infinities, "infinite")) if n]
-        problems.append(f"holds {' and '.join(counts)} of {prediction.size} values; {NODATA_ADVICE}")
+        problems.append(
+            f"holds {' and '.join(counts)} of {prediction.size} values; {NODATA_ADVICE}"
+        )
         if nans + infinities == prediction.size:
             return problems
         prediction = np.where(np.isfinite(prediction), prediction, prediction.dtype.type(0))
         low, high = float(prediction.min()), float(prediction.max())
-    largest = protocol.LARGEST_MM / (1 if units == "mm" else MM_PER_M)  # no working range is above 1 m
+    largest = protocol.LARGEST_MM / (
+        1 if units == "mm" else MM_PER_M
+    )  # no working range is above 1 m
     if max(high, -low) > largest:
         values = f"values up to {max(high, -low):.3g} {units} in magnitude"
         problems.append(f"holds {values}; the limit is {largest:g}; {NODATA_ADVICE}")
     reach = {"mm": reach_mm, "m": reach_mm / MM_PER_M, "normalised": float(reach_mm > 0)}[units]
     if reach and (low < 0 or high > NODATA_FAR * reach):
-        scored = prediction if void is None else np.where(void, prediction.dtype.type(0), prediction)
+        scored = (
+            prediction if void is None else np.where(void, prediction.dtype.type(0), prediction)
+        )
         mark = nodata_problem(scored, reach, NODATA_FAR)
         problems += [f"holds a mark for no surface: {mark}"] if mark else []
     wrong_unit = _unit_problem(prediction, target_mm, units, high, reach_mm)
     return [*problems, wrong_unit] if wrong_unit else problems
 
 
-def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, reach_mm: float) -> str | None:
-    """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can. Where mm are
-    declared, the largest value shows whether the values are metres or shares of the range. Where m or normalised depth
-    is declared, a single stray pixel must not decide, so the median over the object is compared."""
+def _unit_problem(
+    values: Depth, target_mm: Depth, units: Units, high: float, reach_mm: float
+) -> str | None:
+    """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they
+    can. Where mm are declared, the largest value shows whether the values are metres or shares of
+    the range. Where m or normalised depth is declared, a single stray pixel must not decide, so the
+    median over the object is compared."""
     if not reach_mm:
         return None
-    reach = f"its largest value is {high:.4g}, and there are depths up to {reach_mm / MM_PER_M:.4g} m"
+    reach = (
+        f"its largest value is {high:.4g}, and there are depths up to {reach_mm / MM_PER_M:.4g} m"
+    )
     if units == "mm":
         if 0 < high < min(protocol.METRES_BELOW, reach_mm / protocol.UNITS_APART):
             return (
-                f"looks like metres or normalised depth: {reach}; convert it to mm, or declare units: m or normalised"
+                f"looks like metres or normalised depth: {reach}; convert it to mm, or declare "
+                f"units: m or normalised"
             )
         return None
     depths = values[object_mask(target_mm) & (values > 0)]
@@ -121,29 +141,41 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, re
 
 
 def unit_note(largest: float, units: Units) -> str | None:
-    """What looks wrong with ``units`` where no target is known and ``largest`` is the largest value of all samples."""
+    """What looks wrong with ``units`` where no target is known and ``largest`` is the largest value
+    of all samples."""
     suspicious = {
         "mm": (0 < largest < protocol.METRES_BELOW, "are these metres or normalised depth?"),
         "m": (largest > protocol.METRES_AT_MOST, "are these mm?"),
         "normalised": (largest > protocol.METRES_BELOW, "are these m or mm?"),
     }
     wrong, question = suspicious[units]
-    return f"units: {units}, but the largest value of all samples is {largest:.4g}; {question}" if wrong else None
+    return (
+        f"units: {units}, but the largest value of all samples is {largest:.4g}; {question}"
+        if wrong
+        else None
+    )
 
 
 def scored_pair(
-    values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str, left_out: NDArray[np.bool_] | None = None
+    values: Depth,
+    target_mm: Depth,
+    units: Units,
+    mode: Mode,
+    sample: str,
+    left_out: NDArray[np.bool_] | None = None,
 ) -> tuple[Depth, Depth]:
-    """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``. Pixels
-    ``left_out`` (bool (H, W)) do not count in the range of normalised values (`fpp_ml_bench.depth.RangeRule`).
+    """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules
+    of ``mode``. Pixels ``left_out`` (bool (H, W)) do not count in the range of normalised values
+    (`fpp_ml_bench.depth.RangeRule`).
 
-    ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own range,
-    D = v (D_max - D_min) + D_min, except for an exact 0, which stays 0: background, or not measured.
+    ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own
+    range, D = v (D_max - D_min) + D_min, except for an exact 0, which stays 0: background, or not
+    measured.
 
-    ``paper`` differs for normalised values (paper Section 5.3.2, individual normalisation): the target is normalised
-    first, its mask is D_norm > 0, and prediction and target go through the same affine map everywhere. D_min cancels in
-    every difference, so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding
-    and subtracting 1.7 m.
+    ``paper`` differs for normalised values (paper Section 5.3.2, individual normalisation): the
+    target is normalised first, its mask is D_norm > 0, and prediction and target go through the
+    same affine map everywhere. D_min cancels in every difference, so v (D_max - D_min) is scored
+    against D - D_min: the same numbers, without the rounding of adding and subtracting 1.7 m.
 
     Raises DatasetError where the target has no range to normalise by."""
     if units != "normalised":
@@ -164,13 +196,15 @@ def scored_pair(
         raise DatasetError(f"{sample}: {flat}; score it with --mode standard")
     if left_out is not None:  # pixels that are left out may be nearer than D_min, and stay object
         return values.astype(np.float64) * (high - low) + np.where(inside, low, 0.0), target_mm
-    return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)
+    return values.astype(np.float64) * (high - low), np.where(
+        inside, target_mm.astype(np.float64) - low, 0.0
+    )
 
 
 @dataclass(frozen=True)
 class Rules:
-    """By what a sample's prediction is scored: against which depth, in which units it is, over which pixels the range
-    of normalised depth is taken, and the mode."""
+    """By what a sample's prediction is scored: against which depth, in which units it is, over
+    which pixels the range of normalised depth is taken, and the mode."""
 
     target: str
     units: Units
@@ -189,14 +223,15 @@ class Rules:
         return dataset.void(sample, self.target) if self.mode == "standard" else None
 
     def charge_mm(self, rig: Rig) -> float | None:
-        """What a missing or invented pixel costs in the two-sided scores; None by rules without it."""
+        """What a missing or invented pixel costs in the two-sided scores; None by rules without
+        it."""
         return rig.half_range_mm if self.mode == "standard" else None
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A sample's prediction as its files hold it: a map (H, W), the SHA-256 of its file, and its sigma in mm, None
-    where none is stated; ``problems`` with them, by file, usually none."""
+    """A sample's prediction as its files hold it: a map (H, W), the SHA-256 of its file, and its
+    sigma in mm, None where none is stated; ``problems`` with them, by file, usually none."""
 
     values: Depth
     digest: str
@@ -216,7 +251,8 @@ def read_prediction(
     reach_mm: float = 0.0,
     void: NDArray[np.bool_] | None = None,
 ) -> Prediction:
-    """A sample's prediction, by the ``read`` of its ``listing``, and its sigma, checked as `value_problems` does."""
+    """A sample's prediction, by the ``read`` of its ``listing``, and its sigma, checked as
+    `value_problems` does."""
     values, digest, sigma_mm = _NOTHING, "", None
     try:
         values, digest = read(sample)
@@ -235,8 +271,8 @@ def read_prediction(
 
 @dataclass(frozen=True)
 class Checked:
-    """``problems``: a line for each reason to refuse the folder, usually none; ``notes``: what is worth a look.
-    ``size`` (H, W) in px."""
+    """``problems``: a line for each reason to refuse the folder, usually none; ``notes``: what is
+    worth a look. ``size`` (H, W) in px."""
 
     problems: list[str]
     notes: list[str]
@@ -245,18 +281,22 @@ class Checked:
     size: tuple[int, int]
 
     def sound(self) -> Submission:
-        """The description of a folder without problems; PredictionError names them where there are any."""
+        """The description of a folder without problems; PredictionError names them where there are
+        any."""
         if self.problems or self.description is None:
             folder = printable(str(self.listing.folder), 500)
-            raise PredictionError(f"{folder} can't be used, {len(self.problems)} problems:", self.problems)
+            raise PredictionError(
+                f"{folder} can't be used, {len(self.problems)} problems:", self.problems
+            )
         return self.description
 
 
 def checked_description(
     folder: Path, content: dict[Any, Any], form: str, dataset: DatasetFolder | None = None
 ) -> Submission:
-    """The folder's description, checked against the predictions' ``form`` and the ``dataset``, where known. Raises
-    SubmissionError, and DatasetError where it says that other data were predicted."""
+    """The folder's description, checked against the predictions' ``form`` and the ``dataset``,
+    where known. Raises SubmissionError, and DatasetError where it says that other data were
+    predicted."""
     from fpp_ml_bench.evaluation.submission.description import check_submission  # imports pydantic
 
     description = check_submission(folder, content)
@@ -268,7 +308,10 @@ def checked_description(
         expected = f"expected indices from 0 to {frames - 1} of this dataset's sequence"
         problem = f"frames_used: {expected}, got {printable(str(outside), 100)}"
     elif form == ".png" and description.png_mm_per_level is None:
-        problem = "png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
+        problem = (
+            "png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got "
+            "nothing"
+        )
     elif form != ".png" and description.png_mm_per_level is not None:
         problem = f"png_mm_per_level is given, but the predictions are {form}; remove the key"
     else:
@@ -276,10 +319,13 @@ def checked_description(
     raise SubmissionError(f"{printable(str(folder / SUBMISSION_FILE), 500)}: {problem}")
 
 
-def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split: str = "test") -> Checked:
-    """Check everything of a submission that needs no ground truth. With a ``dataset``, its split says which samples of
-    which size are expected; without, the files' names and the size that most of them have do. Raises PredictionError
-    for no folder, and for a form that can't be read without a dataset."""
+def check_folder(
+    folder: str | Path, dataset: DatasetFolder | None = None, split: str = "test"
+) -> Checked:
+    """Check everything of a submission that needs no ground truth. With a ``dataset``, its split
+    says which samples of which size are expected; without, the files' names and the size that most
+    of them have do. Raises PredictionError for no folder, and for a form that can't be read without
+    a dataset."""
     folder = predictions_folder(folder)
     listing = list_folder(folder, dataset, split)
     if dataset is None and not listing.present:
@@ -294,7 +340,11 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
     level_mm, nodata = None, None
     units: Units = "mm"
     if description is not None:
-        level_mm, nodata, units = description.png_mm_per_level, description.nodata, description.units
+        level_mm, nodata, units = (
+            description.png_mm_per_level,
+            description.nodata,
+            description.units,
+        )
     largest = 0.0
     if listing.form != ".png" or level_mm is not None:
         read, unknown = listing.reader(size, level_mm, nodata), np.zeros(size)
@@ -307,9 +357,12 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
 
 
 def _declared_size(listing: Listing) -> tuple[int, int]:
-    """The size (H, W) that most of the files declare. PredictionError where it is too large to be read."""
+    """The size (H, W) that most of the files declare. PredictionError where it is too large to be
+    read."""
     if listing.form == ".mat":
-        raise PredictionError(f"{printable(str(listing.folder), 500)}: .mat files can only be checked with DATASET")
+        raise PredictionError(
+            f"{printable(str(listing.folder), 500)}: .mat files can only be checked with DATASET"
+        )
     files = [listing.folder / f"{sample}{listing.form}" for sample in listing.present]
     declared = {file: size for file in files if (size := declared_size(file)) and min(size) > 0}
     if not declared:
@@ -318,19 +371,27 @@ def _declared_size(listing: Listing) -> tuple[int, int]:
     size = Counter(declared.values()).most_common(1)[0][0]
     if max(size) > LARGEST_SIDE_PX:
         file = next(file for file in declared if declared[file] == size)
-        most = f"expected at most {LARGEST_SIDE_PX} without a dataset; write the depth map itself, or give DATASET"
-        raise PredictionError(f"{printable(str(file), 500)}: declares {size[1]} x {size[0]} px, {most}")
+        most = (
+            f"expected at most {LARGEST_SIDE_PX} without a dataset; write the depth map itself, or "
+            f"give DATASET"
+        )
+        raise PredictionError(
+            f"{printable(str(file), 500)}: declares {size[1]} x {size[0]} px, {most}"
+        )
     return size
 
 
 def predicted_mm(
     folder: Path, dataset: DatasetFolder, split: str, sample: str, target: str
 ) -> tuple[Submission, NDArray[np.floating]]:
-    """The description of predictions of ``split``, which are checked as a whole first, and the depth (H, W) in mm of
-    one ``sample``, 0 where there is no answer; a normalised one with the range of the column ``target``. Raises
-    PredictionError for predictions that could not be scored."""
+    """The description of predictions of ``split``, which are checked as a whole first, and the
+    depth (H, W) in mm of one ``sample``, 0 where there is no answer; a normalised one with the
+    range of the column ``target``. Raises PredictionError for predictions that could not be
+    scored."""
     checked = check_folder(folder, dataset, split)
     described = checked.sound()
     read = checked.listing.reader(dataset.size, described.png_mm_per_level, described.nodata)
     rules = Rules(target, described.units, described.range_rule, "standard")
-    return described, np.maximum(rules.pair(read(sample)[0], dataset, sample)[0], 0)  # a network may go below 0
+    return described, np.maximum(
+        rules.pair(read(sample)[0], dataset, sample)[0], 0
+    )  # a network may go below 0

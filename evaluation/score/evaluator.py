@@ -1,5 +1,5 @@
-"""Scoring a folder of predictions against one split of a dataset, and arrays in memory by the same rules: everything is
-checked, every problem is named."""
+"""Scoring a folder of predictions against one split of a dataset, and arrays in memory by the same
+rules: everything is checked, every problem is named."""
 
 from __future__ import annotations
 
@@ -41,7 +41,12 @@ from fpp_ml_bench.evaluation.score.check import (
     read_prediction,
     value_problems,
 )
-from fpp_ml_bench.evaluation.score.sample_scores import SampleScores, SigmaSample, score_sample, score_sigma
+from fpp_ml_bench.evaluation.score.sample_scores import (
+    SampleScores,
+    SigmaSample,
+    score_sample,
+    score_sigma,
+)
 from fpp_ml_bench.evaluation.submission.prediction_files import (
     Listing,
     MapAndHash,
@@ -74,16 +79,19 @@ def evaluate(
     while_scoring: Callable[[], object] = lambda: None,
     say: Callable[[str], object] = lambda note: None,
 ) -> Result:
-    """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
+    """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a
+    split of ``dataset``.
 
-    ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
-    or ``paper`` (the paper's pixel sets, without void, and its rule for normalised depth). Memory does not grow with
-    the number of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once
-    while threads score: a command uses it to import what it needs afterwards. ``say`` is given a note where another
-    reading of the predictions fits far better (`another_reading`).
+    ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast);
+    ``mode`` is ``standard`` or ``paper`` (the paper's pixel sets, without void, and its rule for
+    normalised depth). Memory does not grow with the number of samples, and the result does not
+    depend on the number of cores. ``while_scoring`` is called once while threads score: a command
+    uses it to import what it needs afterwards. ``say`` is given a note where another reading of the
+    predictions fits far better (`another_reading`).
 
-    Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
-    and DatasetError for a target that is not a depth map, and for other data than was predicted."""
+    Raises SubmissionError for the description, PredictionError (naming every file with a problem)
+    for the predictions, and DatasetError for a target that is not a depth map, and for other data
+    than was predicted."""
     folder = predictions_folder(folder)
     _check_split(dataset, split, target, mode)
     content, description, refusal = {}, None, None
@@ -92,9 +100,13 @@ def evaluate(
     except SubmissionError as error:
         refusal = error
     listing = list_folder(folder, dataset, split)
-    # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
-    # takes long to import: `result` and `submission` are packages that load what is used of them.
-    level, rule = content.get("png_mm_per_level"), "valid" if content.get("range_rule") == "valid" else "object"
+    # What is no number is refused with the description, which is checked while the first files are
+    # scored, for pydantic takes long to import: `result` and `submission` are packages that load
+    # what is used of them.
+    level, rule = (
+        content.get("png_mm_per_level"),
+        "valid" if content.get("range_rule") == "valid" else "object",
+    )
     rules = Rules(target, content.get("units", "mm"), cast(RangeRule, rule), cast(Mode, mode))
     outcomes: Iterable[Scored | list[str]] = ()
     if rules.units in get_args(Units):
@@ -124,7 +136,9 @@ def evaluate(
         raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
     if refusal or description is None:
         raise refusal or SubmissionError(f"{printable(str(folder), 500)}: has no description")
-    if note := another_reading("the predictions", [sample.seen for sample in scored if sample.seen is not None]):
+    if note := another_reading(
+        "the predictions", [sample.seen for sample in scored if sample.seen is not None]
+    ):
         say(note)
     from fpp_ml_bench.evaluation.result.file import environment
     from fpp_ml_bench.evaluation.result.model import Result, scores_of
@@ -132,7 +146,9 @@ def evaluate(
     hashes: dict[tuple[str, str], dict[str, str]] = {}
     for sample in scored:
         for column, digest in sample.hashes.items():
-            hashes.setdefault((dataset.split_of_sample(sample.name), column), {})[sample.name] = digest
+            hashes.setdefault((dataset.split_of_sample(sample.name), column), {})[sample.name] = (
+                digest
+            )
     content = dict(dataset.content_hash(*column, images) for column, images in hashes.items())
     benchmark = benchmark_of(content)
     about: dict[str, Any] = {
@@ -144,7 +160,9 @@ def evaluate(
             "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
             "content": content,
             "code": code_of(dataset.sequence),
-            "benchmark": {"name": benchmark.name, "version": benchmark.version} if benchmark else None,
+            "benchmark": {"name": benchmark.name, "version": benchmark.version}
+            if benchmark
+            else None,
             "split": split,
             "size": list(dataset.size),
             "samples": len(scored),
@@ -162,8 +180,9 @@ def evaluate(
 
 @dataclass(frozen=True)
 class Scored:
-    """A scored sample of an object: its ``row`` (the other keys of `SampleResult`), the scores of its stated
-    uncertainty, None without, the hashes of what it was scored against by column, and of some samples a glance."""
+    """A scored sample of an object: its ``row`` (the other keys of `SampleResult`), the scores of
+    its stated uncertainty, None without, the hashes of what it was scored against by column, and of
+    some samples a glance."""
 
     name: str
     object: str
@@ -195,28 +214,41 @@ def frames_class(sequence: AnySequence, frames_used: Sequence[int]) -> protocol.
 
 
 def _check_split(dataset: DatasetFolder, split: str, target: str, mode: str) -> None:
-    """Refuse (DatasetError) what names no target, mode or sample, and more samples than a result may have."""
-    for name, given, known in (("target", target, protocol.TARGETS), ("mode", mode, protocol.MODES)):
+    """Refuse (DatasetError) what names no target, mode or sample, and more samples than a result
+    may have."""
+    for name, given, known in (
+        ("target", target, protocol.TARGETS),
+        ("mode", mode, protocol.MODES),
+    ):
         if given not in known:
             raise DatasetError(f"expected {name} {' or '.join(known)}, got {printable(given)!r}")
     if target == "depth_exact" and not dataset.has_exact:
-        raise DatasetError(f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth")
+        raise DatasetError(
+            f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth"
+        )
     samples = dataset.samples(split)
     if not samples:
-        raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to score")
+        raise DatasetError(
+            f"{dataset.path}: split {split} holds no sample; there is nothing to score"
+        )
     objects = {split_sample_name(sample)[0] for sample in samples}
     if len(samples) > protocol.MOST_SAMPLES or len(objects) > protocol.MOST_OBJECTS:
         limits = f"at most {protocol.MOST_OBJECTS} objects and {protocol.MOST_SAMPLES} samples"
         raise DatasetError(
-            f"{dataset.path}: split {split} has {len(objects)} and {len(samples)}, {limits} are scored at once"
+            f"{dataset.path}: split {split} has {len(objects)} and {len(samples)}, {limits} are "
+            f"scored at once"
         )
 
 
 def _scored(
-    listing: Listing, read: Callable[[str], MapAndHash], dataset: DatasetFolder, rules: Rules, edge_band_px: int
+    listing: Listing,
+    read: Callable[[str], MapAndHash],
+    dataset: DatasetFolder,
+    rules: Rules,
+    edge_band_px: int,
 ) -> Iterable[Scored | list[str]]:
-    """Each sample that has a prediction, scored, or the problems with its files, in order. Work begins with this call,
-    in threads, before the first outcome is taken from the iterator."""
+    """Each sample that has a prediction, scored, or the problems with its files, in order. Work
+    begins with this call, in threads, before the first outcome is taken from the iterator."""
     dataset_lock = Lock()
     columns = protocol.scored_columns(rules.target, rules.mode, dataset.has_exact)
     glanced_at = set(listing.present[:MOST_GLANCES])
@@ -225,8 +257,14 @@ def _scored(
         with dataset_lock:  # reading the dataset need not be thread-safe
             target = dataset.target_mm(sample, rules.target)
             void = rules.void(dataset, sample)
-            unlit_mm = dataset.unlit_mm(sample) if void is not None and rules.target == "depth_exact" else None
-            scored_on = {rules.target: target} | ({"flags": dataset.flags(sample)} if "flags" in columns else {})
+            unlit_mm = (
+                dataset.unlit_mm(sample)
+                if void is not None and rules.target == "depth_exact"
+                else None
+            )
+            scored_on = {rules.target: target} | (
+                {"flags": dataset.flags(sample)} if "flags" in columns else {}
+            )
         low, high = extremes(target)
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
@@ -243,9 +281,17 @@ def _scored(
             except PredictionError as error:
                 problems = [f"{listing.named(sample)}: {error}"]
             else:
-                stated = None if found.sigma_mm is None else score_sigma(*pair, found.sigma_mm, void, charge_mm)
+                stated = (
+                    None
+                    if found.sigma_mm is None
+                    else score_sigma(*pair, found.sigma_mm, void, charge_mm)
+                )
                 hashes = {column: image_hash(image) for column, image in scored_on.items()}
-                seen = glance(sample, *pair, void, dataset.rig.camera) if sample in glanced_at else None
+                seen = (
+                    glance(sample, *pair, void, dataset.rig.camera)
+                    if sample in glanced_at
+                    else None
+                )
                 row = _row(scores, found.digest)
                 outcome = Scored(sample, split_sample_name(sample)[0], row, stated, hashes, seen)
         with dataset_lock:
@@ -266,26 +312,40 @@ def evaluate_arrays(
     nodata: float | None = None,
     charge_mm: float | None = None,
 ) -> ArrayScores:
-    """Score depth in mm along the camera's axis, 0 = background or not measured, against such depth, 0 = background:
-    floats (N, H, W), or N maps (H, W) that may differ in size. Depths of exactly ``nodata`` are read as 0. Pixels that
-    a masked array of targets masks count in no set. ``flags``: whole numbers, bits of `loaders.sample.Flag`, whose void
-    pixels count in no set. ``sigma``: the standard uncertainty in mm, 0 where none is stated. ``objects``: what each
-    sample shows; samples of the same object are not independent, and the intervals are over objects (by default, each
-    sample is its own). ``units``: ``mm`` or ``m``, of all depths and sigma; must be said where a target reaches less
-    than 10. ``charge_mm``: what a missing or invented pixel costs in the two-sided scores, half a rig's working range;
-    without it there are none.
+    """Score depth in mm along the camera's axis, 0 = background or not measured, against such
+    depth, 0 = background: floats (N, H, W), or N maps (H, W) that may differ in size. Depths of
+    exactly ``nodata`` are read as 0. Pixels that a masked array of targets masks count in no set.
+    ``flags``: whole numbers, bits of `loaders.sample.Flag`, whose void pixels count in no set.
+    ``sigma``: the standard uncertainty in mm, 0 where none is stated. ``objects``: what each sample
+    shows; samples of the same object are not independent, and the intervals are over objects (by
+    default, each sample is its own). ``units``: ``mm`` or ``m``, of all depths and sigma; must be
+    said where a target reaches less than 10. ``charge_mm``: what a missing or invented pixel costs
+    in the two-sided scores, half a rig's working range; without it there are none.
 
-    Raises PredictionError, naming the sample by its number, for numbers or shapes that differ, for what is no real
-    float or not finite, for a negative sigma or target, for masked predictions, for flags that are no such bits, and
-    for depths that look like another unit or like a mark for no surface."""
+    Raises PredictionError, naming the sample by its number, for numbers or shapes that differ, for
+    what is no real float or not finite, for a negative sigma or target, for masked predictions, for
+    flags that are no such bits, and for depths that look like another unit or like a mark for no
+    surface."""
     count = len(_sequence("targets", targets))
-    columns = {"predictions": predictions, "targets": targets, "flags": flags, "sigma": sigma, "objects": objects}
+    columns = {
+        "predictions": predictions,
+        "targets": targets,
+        "flags": flags,
+        "sigma": sigma,
+        "objects": objects,
+    }
     for name, values in columns.items():
         if values is not None and len(_sequence(name, values)) != count:
-            raise PredictionError(f"{name}: expected {count}, one for each target, got {len(values)}")  # type: ignore[arg-type]
+            raise PredictionError(
+                f"{name}: expected {count}, one for each target, got {len(values)}"
+            )  # type: ignore[arg-type]
     if count == 0:
         raise PredictionError("targets: expected one depth map or more, got none")
-    names = [printable(str(name)) for name in objects] if objects is not None else [f"sample {n}" for n in range(count)]
+    names = (
+        [printable(str(name)) for name in objects]
+        if objects is not None
+        else [f"sample {n}" for n in range(count)]
+    )
     scored = []
     for number in range(count):
         try:
@@ -318,9 +378,15 @@ def evaluate_arrays(
 def _sequence(name: str, values: Any) -> Any:
     """``values``, if they are a sequence of maps or names."""
     shape = getattr(values, "shape", None)
-    if isinstance(values, (str, bytes)) or not hasattr(values, "__len__") or (shape is not None and len(shape) == 2):
+    if (
+        isinstance(values, (str, bytes))
+        or not hasattr(values, "__len__")
+        or (shape is not None and len(shape) == 2)
+    ):
         got = type(values).__name__ if shape is None else f"one map {tuple(shape)}"
-        raise PredictionError(f"{name}: expected an array (N, H, W) or a list of maps (H, W), got {got}")
+        raise PredictionError(
+            f"{name}: expected an array (N, H, W) or a list of maps (H, W), got {got}"
+        )
     return values
 
 
@@ -328,15 +394,24 @@ def _array(name: str, values: Any) -> NDArray[Any]:
     """A map as an array; a mask stays where its meaning is clear, with the targets."""
     try:
         array = np.asanyarray(values)
-    except (TypeError, ValueError, RuntimeError) as error:  # ragged lists; tensors with a gradient, or of a GPU
-        raise PredictionError(f"{name}: expected an array (H, W), got {type(values).__name__}: {error}") from None
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # ragged lists; tensors with a gradient, or of a GPU
+        raise PredictionError(
+            f"{name}: expected an array (H, W), got {type(values).__name__}: {error}"
+        ) from None
     if not np.ma.is_masked(array):
         return np.asarray(array)
     if name != "targets":
         advice = (
-            f"write 0 where nothing is known ({name}.filled(0)); to leave pixels out of every score, mask the targets"
+            f"write 0 where nothing is known ({name}.filled(0)); to leave pixels out of every "
+            f"score, mask the targets"
         )
-        raise PredictionError(f"{name}: a masked array, and what a masked pixel means is not known; {advice}")
+        raise PredictionError(
+            f"{name}: a masked array, and what a masked pixel means is not known; {advice}"
+        )
     return array
 
 
@@ -346,16 +421,23 @@ def _void(targets: NDArray[Any], flags: NDArray[Any] | None) -> NDArray[np.bool_
     if flags is None:
         return void
     if flags.shape != targets.shape or flags.dtype.kind not in "iu":
-        advice = "; to leave pixels out of every score, mask the targets" if flags.dtype.kind == "b" else ""
+        advice = (
+            "; to leave pixels out of every score, mask the targets"
+            if flags.dtype.kind == "b"
+            else ""
+        )
         raise PredictionError(
-            f"flags: expected whole numbers {targets.shape}, got {flags.dtype} {flags.shape}; they are the column "
+            f"flags: expected whole numbers {targets.shape}, got {flags.dtype} {flags.shape}; they "
+            f"are the column "
             f"flags of a dataset, bits that mark void pixels, not a mask{advice}"
         )
     most = sum(Flag)
     if not 0 <= flags.min() <= flags.max() <= most:
         bits = ", ".join(f"{flag.value} {(flag.name or '').lower()}" for flag in Flag)
         value = flags.max() if flags.max() > most else flags.min()
-        raise PredictionError(f"flags: expected sums of {bits}, got {value}; a mask of valid pixels is no flags")
+        raise PredictionError(
+            f"flags: expected sums of {bits}, got {value}; a mask of valid pixels is no flags"
+        )
     return void | void_pixels(flags.astype(np.uint8))
 
 
@@ -370,8 +452,8 @@ def score_arrays(
     nodata: float | None = None,
     charge_mm: float | None = None,
 ) -> tuple[SampleScores, SigmaSample | None]:
-    """Score floats (H, W) in ``units``, pixels in ``void`` in no set; `evaluate_arrays` says what is refused.
-    ``check_prediction_units``: whether a prediction that looks like another unit is."""
+    """Score floats (H, W) in ``units``, pixels in ``void`` in no set; `evaluate_arrays` says what
+    is refused. ``check_prediction_units``: whether a prediction that looks like another unit is."""
     prediction, target = without_nodata(prediction, nodata), without_nodata(target, nodata)
     for name, values in (("predictions", prediction), ("targets", target), ("sigma", sigma)):
         if values is None:
@@ -379,7 +461,10 @@ def score_arrays(
         if values.dtype.kind != "f":
             raise PredictionError(f"{name}: expected real floats, got {values.dtype}")
         if target.ndim != 2 or target.size == 0:
-            raise PredictionError(f"targets: expected a map (H, W), got {target.shape}; np.squeeze takes axes of 1 out")
+            raise PredictionError(
+                f"targets: expected a map (H, W), got {target.shape}; np.squeeze takes axes of 1 "
+                f"out"
+            )
         if problem := shape_problem(values.shape, target.shape):
             raise PredictionError(f"{name}: expected a map (H, W) of the target's size: {problem}")
         if name != "predictions" and not (values.min() >= 0 and np.isfinite(values.max())):
@@ -399,8 +484,8 @@ def score_arrays(
 
 
 def explain_eval(dataset: DatasetFolder, split: str, target: str) -> Explanation:
-    """What scoring one split skipped: columns that no score needs, and the search for depth edges far from the object.
-    Reads the split's targets again."""
+    """What scoring one split skipped: columns that no score needs, and the search for depth edges
+    far from the object. Reads the split's targets again."""
     samples, (height, width) = dataset.samples(split), dataset.size
     boxes = {}
     for sample in samples:

@@ -1,17 +1,18 @@
-"""Scores of one sample: MAE and RMSE over the pixel sets, how the object's error is distributed, and what a stated
-uncertainty is worth.
+"""Scores of one sample: MAE and RMSE over the pixel sets, how the object's error is distributed,
+and what a stated uncertainty is worth.
 
-The overall score is composed of object and background, so that overall MAE = f object + (1 - f) background, with f the
-object's share of the pixels, holds by construction.
+The overall score is composed of object and background, so that overall MAE = f object + (1 - f)
+background, with f the object's share of the pixels, holds by construction.
 
-Numerical contract: differences are formed in float64 whatever the input; every sum is float64 over blocks of
-`BLOCK` pixels that fit into the cache, and the block sums are added exactly (`math.fsum`). Errors above 1e140 are
-refused. Errors so small that their squares underflow are divided by the largest before they are squared, so that an
-RMSE is never 0 by underflow.
+Numerical contract: differences are formed in float64 whatever the input; every sum is float64 over
+blocks of `BLOCK` pixels that fit into the cache, and the block sums are added exactly
+(`math.fsum`). Errors above 1e140 are refused. Errors so small that their squares underflow are
+divided by the largest before they are squared, so that an RMSE is never 0 by underflow.
 
-Of a stated uncertainty: how often its intervals hold, how narrow they are, and whether the pixels that a method is
-least sure of are those that are most wrong (sparsification: Ilg et al., ECCV 2018). Intervals are central ones of a
-Gaussian: error within quantile x sigma. The area between two curves is accurate to 1e-12 of the error that it compares.
+Of a stated uncertainty: how often its intervals hold, how narrow they are, and whether the pixels
+that a method is least sure of are those that are most wrong (sparsification: Ilg et al., ECCV
+2018). Intervals are central ones of a Gaussian: error within quantile x sigma. The area between two
+curves is accurate to 1e-12 of the error that it compares.
 """
 
 import math
@@ -31,14 +32,15 @@ from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX
 
 BLOCK = 9600
-"""Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
-would then depend on the number of cores. Below that a score depends on the type of processor only."""
+"""Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the
+rounding of the sum would then depend on the number of cores. Below that a score depends on the type
+of processor only."""
 
 _BLOCKS_AT_ONCE = 8
 _HALF_LOG_2_PI = 0.9189385332046727
 _SQUARES_LOST = 1e-280
-"""Mean square below which squares may have lost digits: the smallest normal number is 2e-308, and an image has about a
-million pixels."""
+"""Mean square below which squares may have lost digits: the smallest normal number is 2e-308, and
+an image has about a million pixels."""
 NOT_FINITE = "the errors are not finite, or too large to square (above about 1e140)"
 
 Map = NDArray[np.floating[Any]]
@@ -47,7 +49,8 @@ Errors = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ErrorStats:
-    """Mean absolute and root mean square error in mm over ``pixels`` pixels; both None for an empty set, never 0."""
+    """Mean absolute and root mean square error in mm over ``pixels`` pixels; both None for an empty
+    set, never 0."""
 
     pixels: int
     mae_mm: float | None
@@ -58,8 +61,13 @@ EMPTY = ErrorStats(0, None, None)
 
 
 def combine(*parts: ErrorStats) -> ErrorStats:
-    """Statistics of the union of disjoint pixel sets, without overflow or underflow; exact for one non-empty part."""
-    filled = [(s.pixels, s.mae_mm, s.rmse_mm) for s in parts if s.mae_mm is not None and s.rmse_mm is not None]
+    """Statistics of the union of disjoint pixel sets, without overflow or underflow; exact for one
+    non-empty part."""
+    filled = [
+        (s.pixels, s.mae_mm, s.rmse_mm)
+        for s in parts
+        if s.mae_mm is not None and s.rmse_mm is not None
+    ]
     if not filled:
         return EMPTY
     total = sum(n for n, _, _ in filled)
@@ -83,12 +91,17 @@ def mean_of(errors: Errors) -> float | None:
     """Mean of float64 values (n,) of either sign, in the same blocks; None for no values."""
     if errors.size == 0:
         return None
-    return math.fsum(float(errors[i : i + BLOCK].sum()) for i in range(0, errors.size, BLOCK)) / errors.size
+    return (
+        math.fsum(float(errors[i : i + BLOCK].sum()) for i in range(0, errors.size, BLOCK))
+        / errors.size
+    )
 
 
-def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], Errors]) -> ErrorStats:
-    """Statistics from the sums of the blocks; ``errors`` gives the errors (n,), needed where the squares underflow.
-    Raises PredictionError where a sum is not finite."""
+def _from_sums(
+    pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], Errors]
+) -> ErrorStats:
+    """Statistics from the sums of the blocks; ``errors`` gives the errors (n,), needed where the
+    squares underflow. Raises PredictionError where a sum is not finite."""
     if pixels == 0:
         return EMPTY
     try:
@@ -107,9 +120,10 @@ def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors:
 def _background(
     prediction: Map, target: Map, void: NDArray[np.bool_] | None
 ) -> tuple[ErrorStats, int, NDArray[np.bool_]]:
-    """Statistics of every pixel that is neither object nor void, by setting the errors of those to 0, how many of them
-    are predicted above 0, and the mask of the object; all (n,). Not overall minus object: that would leave rounding
-    errors where the background is perfect. Everything is done block by block, while the block is in the cache."""
+    """Statistics of every pixel that is neither object nor void, by setting the errors of those to
+    0, how many of them are predicted above 0, and the mask of the object; all (n,). Not overall
+    minus object: that would leave rounding errors where the background is perfect. Everything is
+    done block by block, while the block is in the cache."""
     inside = np.empty(target.shape, dtype=bool)
     buffer = np.zeros((_BLOCKS_AT_ONCE, BLOCK))
     flat, step = buffer.reshape(-1), buffer.size
@@ -123,7 +137,8 @@ def _background(
             excluded = excluded | void[part]
         errors = flat[: excluded.size]
         np.copyto(errors, prediction[part])
-        # A target without negative values is exactly 0 on the background: there the prediction is the error.
+        # A target without negative values is exactly 0 on the background: there the prediction is
+        # the error.
         if not target[part].min() >= 0:
             errors -= target[part]
         scored = excluded.size - int(np.count_nonzero(excluded))
@@ -148,24 +163,27 @@ _EDGE, _WIDE, _MISSING = 1, 2, 4
 
 def _zones(bits: int, value: int) -> cached_property[ErrorStats]:
     """The statistics of the union of all zones whose ``bits`` have this ``value``."""
-    return cached_property(lambda self: combine(*(stats for zone, stats in self.zones.items() if zone & bits == value)))
+    return cached_property(
+        lambda self: combine(*(stats for zone, stats in self.zones.items() if zone & bits == value))
+    )
 
 
 @dataclass(frozen=True)
 class SampleScores:
-    """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they were scored,
-    ``surface``: where the target has a depth, ``void_mask``: which pixels are in no set, None by rules without void;
-    and ``errors``: prediction minus target in mm on the object's pixels, float64 (n,), of which those in ``predicted``
-    (bool (n,)) were measured.
+    """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they
+    were scored, ``surface``: where the target has a depth, ``void_mask``: which pixels are in no
+    set, None by rules without void; and ``errors``: prediction minus target in mm on the object's
+    pixels, float64 (n,), of which those in ``predicted`` (bool (n,)) were measured.
 
-    Statistics of the background and of the object's zones. A zone's number is a sum of 1 (nearer to a depth edge than
-    the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or less); every MAE and RMSE of
-    the object is that of a union of zones. ``unlit``: statistics of the unlit pixels, ``unlit_valid`` of those that
-    were measured; ``scores_unlit``: whether the rules know them. ``range_mm``: largest minus smallest depth of the
-    object. ``invented``: how many background pixels are predicted above 0; ``charge_mm``: what one of them and a pixel
-    that was not measured costs in `two_sided_mm`, None by rules without it; ``void_surface`` and
-    ``void_surface_valid``: statistics of void pixels whose target has a depth, and of those of them that were
-    measured."""
+    Statistics of the background and of the object's zones. A zone's number is a sum of 1 (nearer to
+    a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0
+    mm or less); every MAE and RMSE of the object is that of a union of zones. ``unlit``: statistics
+    of the unlit pixels, ``unlit_valid`` of those that were measured; ``scores_unlit``: whether the
+    rules know them. ``range_mm``: largest minus smallest depth of the object. ``invented``: how
+    many background pixels are predicted above 0; ``charge_mm``: what one of them and a pixel that
+    was not measured costs in `two_sided_mm`, None by rules without it; ``void_surface`` and
+    ``void_surface_valid``: statistics of void pixels whose target has a depth, and of those of them
+    that were measured."""
 
     prediction_mm: Map
     target_mm: Map
@@ -211,19 +229,31 @@ class SampleScores:
 
     @property
     def invented_share(self) -> float | None:
-        """Background pixels predicted above 0 over the object's pixels; None by rules without a charge."""
-        return None if self.charge_mm is None or not self.object.pixels else self.invented / self.object.pixels
+        """Background pixels predicted above 0 over the object's pixels; None by rules without a
+        charge."""
+        return (
+            None
+            if self.charge_mm is None or not self.object.pixels
+            else self.invented / self.object.pixels
+        )
 
     def two_sided_mm(self, with_void: bool = False) -> float | None:
-        """Errors of the measured pixels of the object, and the charge for each that was not measured and for each
-        invented one, over the object's pixels; ``with_void``: void surface belongs to the object."""
+        """Errors of the measured pixels of the object, and the charge for each that was not
+        measured and for each invented one, over the object's pixels; ``with_void``: void surface
+        belongs to the object."""
         whole, valid = self.object, self.valid
         if with_void:
-            whole, valid = combine(whole, self.void_surface), combine(valid, self.void_surface_valid)
+            whole, valid = (
+                combine(whole, self.void_surface),
+                combine(valid, self.void_surface_valid),
+            )
         if self.charge_mm is None or not whole.pixels:
             return None
         charged = whole.pixels - valid.pixels + self.invented
-        return math.fsum(((valid.mae_mm or 0.0) * valid.pixels, self.charge_mm * charged)) / whole.pixels
+        return (
+            math.fsum(((valid.mae_mm or 0.0) * valid.pixels, self.charge_mm * charged))
+            / whole.pixels
+        )
 
     @cached_property
     def magnitudes(self) -> Errors:
@@ -237,7 +267,11 @@ class SampleScores:
     def within(self, limit_mm: float) -> float | None:
         """Share of the object whose absolute error is at most ``limit_mm``."""
         count = self.errors.size
-        return float(np.searchsorted(self.magnitudes, limit_mm, side="right")) / count if count else None
+        return (
+            float(np.searchsorted(self.magnitudes, limit_mm, side="right")) / count
+            if count
+            else None
+        )
 
     @property
     def bias_mm(self) -> float | None:
@@ -255,14 +289,25 @@ class SampleScores:
         return None if offset is None else mean_of(np.abs(self.errors - offset))
 
     def metrics(self) -> dict[str, float | None]:
-        """Every metric by its key: None where the pixel set is empty, and those that a file may leave out left out."""
+        """Every metric by its key: None where the pixel set is empty, and those that a file may
+        leave out left out."""
         values = {key: metric.value(self) for key, metric in METRICS.items()}
-        return {key: value for key, value in values.items() if value is not None or not METRICS[key].optional}
+        return {
+            key: value
+            for key, value in values.items()
+            if value is not None or not METRICS[key].optional
+        }
 
     def pixels(self) -> dict[str, int | None]:
-        """How many pixels each set of a result's row has; None for a set that the rules do not know."""
+        """How many pixels each set of a result's row has; None for a set that the rules do not
+        know."""
         unlit = self.unlit.pixels if self.scores_unlit else None
-        counts = {"object": self.object.pixels, "background": self.background.pixels, "void": self.void, "unlit": unlit}
+        counts = {
+            "object": self.object.pixels,
+            "background": self.background.pixels,
+            "void": self.void,
+            "unlit": unlit,
+        }
         return {f"{name}_pixels": count for name, count in counts.items()}
 
 
@@ -277,14 +322,15 @@ def score_sample(
 ) -> SampleScores:
     """Score one depth map against its target.
 
-    ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0 = background. Pixel
-    sets after paper Section 5.3.2 (`fpp_ml_bench.depth`): object where the target is above 0, else background. Pixels
-    in ``void`` (bool (H, W)) are in neither; they still take part in finding the depth edges. ``unlit_mm`` (H, W): true
-    depth in mm of the pixels that are scored as a set of their own, 0 elsewhere. ``charge_mm``: what a pixel costs that
-    is missing or invented; without it the two-sided scores are None.
+    ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0
+    = background. Pixel sets after paper Section 5.3.2 (`fpp_ml_bench.depth`): object where the
+    target is above 0, else background. Pixels in ``void`` (bool (H, W)) are in neither; they still
+    take part in finding the depth edges. ``unlit_mm`` (H, W): true depth in mm of the pixels that
+    are scored as a set of their own, 0 elsewhere. ``charge_mm``: what a pixel costs that is missing
+    or invented; without it the two-sided scores are None.
 
-    Raises PredictionError for shapes that differ, dtypes that are not real floats, errors that are not finite, and a
-    charge that is none.
+    Raises PredictionError for shapes that differ, dtypes that are not real floats, errors that are
+    not finite, and a charge that is none.
 
     >>> import numpy as np
     >>> target = np.array([[0.0, 1800.0]])
@@ -295,16 +341,22 @@ def score_sample(
         expected = f"expected a prediction of the target's shape {target_mm.shape} (H, W)"
         raise PredictionError(f"{expected}, got {prediction_mm.shape}")
     if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
-        raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
+        raise PredictionError(
+            f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}"
+        )
     if charge_mm is not None and not 0 < charge_mm <= protocol.LARGEST_MM:
-        raise PredictionError(f"charge_mm: expected mm above 0, half of the rig's working range; got {charge_mm}")
+        raise PredictionError(
+            f"charge_mm: expected mm above 0, half of the rig's working range; got {charge_mm}"
+        )
     for name, part in (("void", void), ("unlit_mm", unlit_mm)):
         if part is not None and part.shape != target_mm.shape:
             raise PredictionError(f"{name}: expected a map of {target_mm.shape}, got {part.shape}")
     prediction = prediction_mm.ravel()
     flat_void = None if void is None else void.ravel()
     background, invented, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
-    unlit, measured = (EMPTY, EMPTY) if unlit_mm is None else _surface_stats(prediction, unlit_mm.ravel())
+    unlit, measured = (
+        (EMPTY, EMPTY) if unlit_mm is None else _surface_stats(prediction, unlit_mm.ravel())
+    )
     void_surface = EMPTY, EMPTY
     if charge_mm is not None and flat_void is not None:
         void_surface = _surface_stats(prediction, np.where(flat_void, target_mm.ravel(), 0))
@@ -315,7 +367,9 @@ def score_sample(
     true_mm = target_mm[box].ravel().take(index)
     errors = _errors(depths, true_mm)
     predicted = depths > 0
-    near, wide = object_near_edges(target_mm[box], (edge_band_px, WIDE_BAND_PX), edge_jump_mm(target_mm.shape[1]))
+    near, wide = object_near_edges(
+        target_mm[box], (edge_band_px, WIDE_BAND_PX), edge_jump_mm(target_mm.shape[1])
+    )
     zone = near.ravel().take(index).view(np.uint8) * np.uint8(_EDGE)
     zone |= wide.ravel().take(index).view(np.uint8) * np.uint8(_WIDE)
     zone |= (~predicted).view(np.uint8) * np.uint8(_MISSING)
@@ -333,7 +387,9 @@ def score_sample(
         errors,
         predicted,
         {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()},
-        range_mm if range_mm > 1e-150 else 0.0,  # else an error may exceed it by more than a float64 can hold
+        range_mm
+        if range_mm > 1e-150
+        else 0.0,  # else an error may exceed it by more than a float64 can hold
         invented,
         charge_mm,
         *void_surface,
@@ -350,7 +406,8 @@ def _errors(depths: Map, true_mm: Map) -> Errors:
 
 
 def _surface_stats(prediction: Map, surface_mm: Map) -> tuple[ErrorStats, ErrorStats]:
-    """Statistics of the errors (n,) where ``surface_mm`` is above 0, and of those of them that were measured."""
+    """Statistics of the errors (n,) where ``surface_mm`` is above 0, and of those of them that were
+    measured."""
     index = np.flatnonzero(object_mask(surface_mm))
     depths = prediction.take(index)
     errors = _errors(depths, surface_mm.take(index))
@@ -358,7 +415,8 @@ def _surface_stats(prediction: Map, surface_mm: Map) -> tuple[ErrorStats, ErrorS
 
 
 def _quantile(ascending: Errors, level: float) -> float | None:
-    """A quantile of ascending values (n,) by linear interpolation, NumPy's default; None for no values."""
+    """A quantile of ascending values (n,) by linear interpolation, NumPy's default; None for no
+    values."""
     if not ascending.size:
         return None
     below, part = divmod(level * (ascending.size - 1), 1.0)
@@ -368,10 +426,11 @@ def _quantile(ascending: Errors, level: float) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class SigmaSample:
-    """Of one sample, what its scores are made of: the share of object pixels that state no sigma; of the others mean
-    and median sigma in mm, and the mean negative log-likelihood; ``observed``: the share of stated pixels within the
-    interval of each of `protocol.NOMINAL`; ``curves``: the errors in mm after each of `protocol.LEFT_OUT` has been left
-    out, ``mae_mm`` and ``rmse_mm`` by sigma, ``best_*`` by the error itself. None where there is no such pixel."""
+    """Of one sample, what its scores are made of: the share of object pixels that state no sigma;
+    of the others mean and median sigma in mm, and the mean negative log-likelihood; ``observed``:
+    the share of stated pixels within the interval of each of `protocol.NOMINAL`; ``curves``: the
+    errors in mm after each of `protocol.LEFT_OUT` has been left out, ``mae_mm`` and ``rmse_mm`` by
+    sigma, ``best_*`` by the error itself. None where there is no such pixel."""
 
     curves: dict[str, list[float]] | None = None
     unstated_share: float | None = None
@@ -387,28 +446,38 @@ class SigmaSample:
 
     def within(self, percent: int) -> float | None:
         """Share of the stated pixels within the interval of one of `protocol.COVERED`."""
-        return None if self.observed is None else self.observed[protocol.NOMINAL.index(percent / 100)]
+        return (
+            None if self.observed is None else self.observed[protocol.NOMINAL.index(percent / 100)]
+        )
 
     def sure_mm(self, error: str) -> float | None:
         """``mae_mm`` or ``rmse_mm`` of the object without its least sure pixels."""
-        return None if self.curves is None else self.curves[error][protocol.LEFT_OUT.index(protocol.SURE_LEFT_OUT)]
+        return (
+            None
+            if self.curves is None
+            else self.curves[error][protocol.LEFT_OUT.index(protocol.SURE_LEFT_OUT)]
+        )
 
     def area_mm(self, error: str) -> float | None:
-        """Mean distance of the two curves of ``mae_mm`` or ``rmse_mm``. Never below 0 but by rounding: no order leaves
-        smaller errors than that of the errors themselves."""
+        """Mean distance of the two curves of ``mae_mm`` or ``rmse_mm``. Never below 0 but by
+        rounding: no order leaves smaller errors than that of the errors themselves."""
         if self.curves is None:
             return None
-        return mean_of(np.maximum(np.array(self.curves[error]) - np.array(self.curves[f"best_{error}"]), 0.0))
+        return mean_of(
+            np.maximum(np.array(self.curves[error]) - np.array(self.curves[f"best_{error}"]), 0.0)
+        )
 
 
 @cache
 def gaussian_quantile(coverage: float) -> float:
-    """Half the width, in sigmas, of the central interval of a Gaussian that holds ``coverage`` of it."""
+    """Half the width, in sigmas, of the central interval of a Gaussian that holds ``coverage`` of
+    it."""
     return NormalDist().inv_cdf((1 + coverage) / 2)
 
 
 def states_sigma(depth_mm: Map, sigma_mm: Map) -> NDArray[np.bool_]:
-    """Pixels that state an uncertainty: they have an answer, and a sigma above 0 (both of any same shape, in mm)."""
+    """Pixels that state an uncertainty: they have an answer, and a sigma above 0 (both of any same
+    shape, in mm)."""
     return (depth_mm > 0) & (sigma_mm > 0)
 
 
@@ -419,10 +488,11 @@ def score_sigma(
     void: NDArray[np.bool_] | None = None,
     charge_mm: float | None = None,
 ) -> SigmaSample:
-    """Score the stated standard uncertainty ``sigma_mm`` of ``prediction_mm`` over the object pixels of ``target_mm``
-    that are not ``void``; all (H, W), in mm, sigma of 0 and more. With ``charge_mm`` that is the error of a pixel
-    without an answer, and the invented pixels of the background, whose error it is too, are left out or kept with the
-    object's. Raises PredictionError for another shape."""
+    """Score the stated standard uncertainty ``sigma_mm`` of ``prediction_mm`` over the object
+    pixels of ``target_mm`` that are not ``void``; all (H, W), in mm, sigma of 0 and more. With
+    ``charge_mm`` that is the error of a pixel without an answer, and the invented pixels of the
+    background, whose error it is too, are left out or kept with the object's. Raises
+    PredictionError for another shape."""
     if not prediction_mm.shape == target_mm.shape == sigma_mm.shape:
         raise PredictionError(f"sigma: expected a map of {target_mm.shape}, got {sigma_mm.shape}")
     surface = object_mask(target_mm)
@@ -436,38 +506,47 @@ def score_sigma(
     if charge_mm is not None:
         outside = ~surface & (prediction_mm > 0)
         invented = sigma_mm[outside if void is None else outside & ~void].astype(np.float64)
-        charged = np.append(np.where(depth > 0, magnitude, charge_mm), np.full(invented.size, charge_mm))
+        charged = np.append(
+            np.where(depth > 0, magnitude, charge_mm), np.full(invented.size, charge_mm)
+        )
         unsure = np.append(unsure, np.where(invented > 0, invented, np.inf))
     curves = _curves(charged, unsure, magnitude.size)
     unstated = 1 - np.count_nonzero(stated) / stated.size
     if not stated.any():
         return SigmaSample(curves, unstated)
     magnitude, sigma = magnitude[stated], sigma[stated]
-    observed = [float(np.mean(magnitude <= gaussian_quantile(level) * sigma)) for level in protocol.NOMINAL]
+    observed = [
+        float(np.mean(magnitude <= gaussian_quantile(level) * sigma)) for level in protocol.NOMINAL
+    ]
     likelihood = mean_of(_negative_log_likelihood(magnitude, sigma))
-    return SigmaSample(curves, unstated, observed, mean_of(sigma), float(np.median(sigma)), likelihood)
+    return SigmaSample(
+        curves, unstated, observed, mean_of(sigma), float(np.median(sigma)), likelihood
+    )
 
 
 def _negative_log_likelihood(magnitude: Errors, sigma: Errors) -> Errors:
-    """Of each error under a Gaussian, in nats with sigma in mm. Sigma is at least `NLL_LEAST_SIGMA_MM`, and the error
-    at most `NLL_LARGEST_RATIO` sigmas, so that neither an error of 0 nor a wrong order decides the mean."""
+    """Of each error under a Gaussian, in nats with sigma in mm. Sigma is at least
+    `NLL_LEAST_SIGMA_MM`, and the error at most `NLL_LARGEST_RATIO` sigmas, so that neither an error
+    of 0 nor a wrong order decides the mean."""
     floored = np.maximum(sigma, protocol.NLL_LEAST_SIGMA_MM)
     ratio = np.minimum(magnitude / floored, protocol.NLL_LARGEST_RATIO)
     return np.log(floored) + _HALF_LOG_2_PI + 0.5 * ratio * ratio
 
 
 def _curves(magnitude: Errors, sigma: Errors, pixels: int) -> dict[str, list[float]]:
-    """The curves of `SigmaSample` of an object of so many ``pixels``, behind whose errors those of invented pixels may
-    stand: left out are shares of the object's pixels, and means are over its others. Of pixels of the same sigma an
-    equal part of each is left out, so that the order of the pixels does not matter; a pixel at the cut counts in
-    part."""
+    """The curves of `SigmaSample` of an object of so many ``pixels``, behind whose errors those of
+    invented pixels may stand: left out are shares of the object's pixels, and means are over its
+    others. Of pixels of the same sigma an equal part of each is left out, so that the order of the
+    pixels does not matter; a pixel at the cut counts in part."""
     over = pixels * (1 - np.array(protocol.LEFT_OUT))
     kept = over + (magnitude.size - pixels)
     curves = {}
     for prefix, key in (("", sigma), ("best_", magnitude)):
         order = np.argsort(key, kind="stable")
         ascending = key[order]
-        last = np.flatnonzero(np.append(ascending[1:] != ascending[:-1], True))  # of each run of equal keys
+        last = np.flatnonzero(
+            np.append(ascending[1:] != ascending[:-1], True)
+        )  # of each run of equal keys
         for name, values in (("mae_mm", magnitude[order]), ("rmse_mm", magnitude[order] ** 2)):
             sums = np.concatenate([[0.0], np.cumsum(values)[last]])
             means = np.interp(kept, np.concatenate([[0], last + 1]), sums) / over

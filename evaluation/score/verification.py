@@ -1,9 +1,11 @@
-"""What of a result does not follow from predictions: they are scored again, and every number is compared.
+"""What of a result does not follow from predictions: they are scored again, and every number is
+compared.
 
-A method run again on another machine does not give the same bytes: processors add float32 numbers in another order, so
-phases differ in the last digits, and a few pixels that stand between two orders, or between object and background,
-change sides. Nobody can tell such predictions from others by their hash, but their errors hardly differ:
-`of_processors` says whether they stay within a bound.
+A method run again on another machine does not give the same bytes: processors add float32 numbers
+in another order, so phases differ in the last digits, and a few pixels that stand between two
+orders, or between object and background, change sides. Nobody can tell such predictions from others
+by their hash, but their errors hardly differ: `of_processors` says whether they stay within a
+bound.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,13 +25,14 @@ Difference = tuple[str, Any, Any]
 PROCESSOR_ERROR = 1e-3
 """Relative difference of a score that processors may make."""
 PROCESSOR_PIXELS = 1e-4
-"""Share of an object's or sample's pixels that may change sides, each by the far end of the working range at most. On
-an Intel and an AMD processor, fringe-net's background MAE of one object is 2.485 and 2.431 mm, which is 3e-5 of its
-pixels; object MAE is equal to 1e-4."""
+"""Share of an object's or sample's pixels that may change sides, each by the far end of the working
+range at most. On an Intel and an AMD processor, fringe-net's background MAE of one object is 2.485
+and 2.431 mm, which is 3e-5 of its pixels; object MAE is equal to 1e-4."""
 PROCESSOR_MEAN_PIXELS = 3e-5
 """The same in means over all samples, where the changes of one cancel those of another."""
 MOST_BY_PIXEL = 50.0
-"""What a pixel can change in a score that is no error in mm: the negative log-likelihood, the steepest of them."""
+"""What a pixel can change in a score that is no error in mm: the negative log-likelihood, the
+steepest of them."""
 _HASHES = "prediction_sha256", "predictions_sha256", "sigma_sha256"
 _SCORES = "metrics", "intervals", "per_object", "uncertainty"
 _COMPARED: dict[str, Any] = {
@@ -39,62 +42,94 @@ _COMPARED: dict[str, Any] = {
 }
 """What of a result is compared; the rest follows from it, or is its time and place."""
 _RUN_TIME = {"submission": {"seconds_per_sample", "seconds_source", "hardware", "timing"}}
-"""`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
+"""`fpp-bench time` may write these into a result later; run times can't be recomputed from
+predictions."""
 
 
 class Verified(NamedTuple):
-    """``lines``: what does not follow from the predictions, one for each difference; ``processors``: whether that is no
-    more than what other processors change in the predictions of the same method."""
+    """``lines``: what does not follow from the predictions, one for each difference;
+    ``processors``: whether that is no more than what other processors change in the predictions of
+    the same method."""
 
     lines: list[str]
     processors: bool = False
 
 
 def differences(scored: Result, folder: Any, dataset: DatasetFolder) -> Verified:
-    """What of a result does not follow from the predictions in ``folder`` on ``dataset``. Everything is scored again.
-    Time and place of scoring and the method's run time are not compared. Raises what `evaluate` raises, and
-    SubmissionError for a result of another protocol version, which this one can't recompute."""
+    """What of a result does not follow from the predictions in ``folder`` on ``dataset``.
+    Everything is scored again. Time and place of scoring and the method's run time are not
+    compared. Raises what `evaluate` raises, and SubmissionError for a result of another protocol
+    version, which this one can't recompute."""
     if scored.protocol_version != protocol.PROTOCOL_VERSION:
         raise SubmissionError(
-            f"the result was scored by protocol {scored.protocol_version}, this is {protocol.PROTOCOL_VERSION}; verify "
-            "it with the version of fpp-ml-bench that its environment names, or score the predictions again"
+            f"the result was scored by protocol {scored.protocol_version}, this is "
+            f"{protocol.PROTOCOL_VERSION}; verify "
+            "it with the version of fpp-ml-bench that its environment names, or score the "
+            "predictions again"
         )
     here = printable(str(dataset.path), 200)
     for key, digest in scored.dataset.content.items():
         if dataset.content.get(key) != digest:
             scored_on = f"{digest} of {_value_text(scored.dataset.identity)} in the result"
             return Verified(
-                [f"dataset.content.{key}: {scored_on}, {dataset.content.get(key, 'none')} is what {here} has"]
+                [
+                    f"dataset.content.{key}: {scored_on}, {dataset.content.get(key, 'none')} is "
+                    f"what {here} has"
+                ]
             )
-    again = evaluate(folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode)
-    stored, computed = (result.model_dump(include=_COMPARED, exclude=_RUN_TIME) for result in (scored, again))
-    rows, again_rows = ({row["sample"]: row for row in part.pop("per_sample")} for part in (stored, computed))
+    again = evaluate(
+        folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode
+    )
+    stored, computed = (
+        result.model_dump(include=_COMPARED, exclude=_RUN_TIME) for result in (scored, again)
+    )
+    rows, again_rows = (
+        {row["sample"]: row for row in part.pop("per_sample")} for part in (stored, computed)
+    )
     block, again_block = (part.pop("uncertainty", None) for part in (stored, computed))
     found = list(disagreements(stored, computed))
     if rows.keys() != again_rows.keys():
         return Verified([*difference_lines(found), "per_sample: other samples than the split has"])
     for sample, row in again_rows.items():
-        differing = disagreements(rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0))
+        differing = disagreements(
+            rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0)
+        )
         # Other predictions explain all the rest.
         first = sorted(differing, key=lambda difference: difference[0] not in _HASHES)
         found += [(f"{sample}: {name}", *pair) for name, *pair in first]
     if (block is None) != (again_block is None):
-        said = ["there is none" if part is None else "there is one" for part in (block, again_block)]
-        return Verified([*difference_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"])
+        said = [
+            "there is none" if part is None else "there is one" for part in (block, again_block)
+        ]
+        return Verified(
+            [
+                *difference_lines(found),
+                f"uncertainty: {said[0]} in the result, {said[1]} recomputed",
+            ]
+        )
     found += disagreements(block, again_block, "uncertainty", rounding=1e-12)  # nll is near 0
-    means = [(f"metrics.{key}", *(getattr(result.metrics, key) for result in (scored, again))) for key in RANKED]
+    means = [
+        (f"metrics.{key}", *(getattr(result.metrics, key) for result in (scored, again)))
+        for key in RANKED
+    ]
     means = [difference for difference in means if difference[1] is not None]
-    return Verified(difference_lines(found), of_processors([*found, *means], dataset.rig.working_range_mm[1]))
+    return Verified(
+        difference_lines(found), of_processors([*found, *means], dataset.rig.working_range_mm[1])
+    )
 
 
 def of_processors(found: Sequence[Difference], far_mm: float) -> bool:
-    """Whether the differences of a result or row are hashes of predictions, and scores that differ by no more than
-    `PROCESSOR_ERROR` and what `PROCESSOR_PIXELS` can change, ``far_mm`` each; means by `PROCESSOR_MEAN_PIXELS`. Scores
-    that differ where the predictions do not are no work of a processor."""
+    """Whether the differences of a result or row are hashes of predictions, and scores that differ
+    by no more than `PROCESSOR_ERROR` and what `PROCESSOR_PIXELS` can change, ``far_mm`` each; means
+    by `PROCESSOR_MEAN_PIXELS`. Scores that differ where the predictions do not are no work of a
+    processor."""
     changed = {_place(name) for name, *_ in found if name.split(": ")[-1] in _HASHES}
     return bool(changed) and all(
         name.split(": ")[-1] in _HASHES
-        or ((": " not in name or _place(name) in changed) and _within(name, stored, computed, far_mm))
+        or (
+            (": " not in name or _place(name) in changed)
+            and _within(name, stored, computed, far_mm)
+        )
         for name, stored, computed in found
     )
 
@@ -107,9 +142,16 @@ def _place(name: str) -> str:
 def _within(name: str, stored: Any, computed: Any, far_mm: float) -> bool:
     of_sample = ": " in name
     words = [word for word in name.split(": ")[-1].split(".") if not word.isdigit()]
-    if not (isinstance(stored, float) and isinstance(computed, float) and (of_sample or words[0] in _SCORES)):
+    if not (
+        isinstance(stored, float)
+        and isinstance(computed, float)
+        and (of_sample or words[0] in _SCORES)
+    ):
         return False
-    key, of_means = words[-1], not of_sample and words[0] != "per_object" and "per_sample" not in words
+    key, of_means = (
+        words[-1],
+        not of_sample and words[0] != "per_object" and "per_sample" not in words,
+    )
     if key == "object_max_mm":
         return True  # one pixel is enough
     pixels, cost = (
@@ -117,7 +159,9 @@ def _within(name: str, stored: Any, computed: Any, far_mm: float) -> bool:
         far_mm if key.endswith("_mm") else MOST_BY_PIXEL,
     )
     if "rmse" in key:
-        return bool(abs(stored**2 - computed**2) <= 2 * PROCESSOR_ERROR * stored**2 + pixels * cost**2)
+        return bool(
+            abs(stored**2 - computed**2) <= 2 * PROCESSOR_ERROR * stored**2 + pixels * cost**2
+        )
     return bool(abs(stored - computed) <= PROCESSOR_ERROR * abs(stored) + pixels * cost)
 
 

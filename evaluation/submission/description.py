@@ -1,5 +1,5 @@
-"""``submission.yaml``: the description of a submission, read into a strict model and written from it, and a template
-to fill in."""
+"""``submission.yaml``: the description of a submission, read into a strict model and written from
+it, and a template to fill in."""
 
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -17,9 +17,9 @@ from fpp_ml_bench.schema import Count, Positive, Scalar, SparseModel, StrictMode
 
 
 class LearnedFrom(StrictModel):
-    """What data a method learned from: the training split of benchmarks of this package (``train-split``), other data
-    that its renderer made (``generated``), any other data, or none. ``versions`` name them, like ``fpp-bench-full
-    version 1``."""
+    """What data a method learned from: the training split of benchmarks of this package
+    (``train-split``), other data that its renderer made (``generated``), any other data, or none.
+    ``versions`` name them, like ``fpp-bench-full version 1``."""
 
     data: Literal["train-split", "generated", "other", "none"]
     versions: list[Text] = Field(default_factory=list, max_length=50)
@@ -27,15 +27,18 @@ class LearnedFrom(StrictModel):
     @model_validator(mode="after")
     def _consistent(self) -> "LearnedFrom":
         if self.data == "none" and self.versions:
-            raise ValueError("a method that learned from no data has no versions of it; remove them")
+            raise ValueError(
+                "a method that learned from no data has no versions of it; remove them"
+            )
         if self.data == "train-split" and not self.versions:
             raise ValueError("data: train-split needs versions, like [fpp-bench-full version 1]")
         return self
 
 
 class Predicted(StrictModel):
-    """What ``fpp-bench predict`` read: the folder of the ``dataset``, the ``split``, and the hashes of that ``content``
-    of it (``split/column``, as in a manifest) that the method reads or is scored on."""
+    """What ``fpp-bench predict`` read: the folder of the ``dataset``, the ``split``, and the hashes
+    of that ``content`` of it (``split/column``, as in a manifest) that the method reads or is
+    scored on."""
 
     dataset: str = Field(min_length=1, max_length=4096)
     split: Text
@@ -43,19 +46,29 @@ class Predicted(StrictModel):
 
 
 class Submission(SparseModel):
-    """Content of ``submission.yaml``. ``frames_used`` are indices into the dataset's frame sequence (0 based).
+    """Content of ``submission.yaml``. ``frames_used`` are indices into the dataset's frame sequence
+    (0 based).
 
-    ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm, ``nodata`` the
-    value of pixels without a surface where that is not 0, in the unit of the files.
-    ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
-    on, by ``range_rule`` (`fpp_ml_bench.depth.RangeRule`); ``uses_ground_truth_mask`` when it was given which of their
-    pixels are object (for example an input that is black outside the object), ``uses_ground_truth_order`` when it was
-    given their true fringe orders; defaults of these three are never written, so that files without the keys stay as
-    they are. ``learned_from`` is absent where it is unknown.
-    ``predicted`` says what ``fpp-bench predict`` read, so that fpp-eval finds it; a result does not repeat it.
-    ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it."""
+    ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in
+    mm, ``nodata`` the value of pixels without a surface where that is not 0, in the unit of the
+    files. ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of
+    the samples it is scored on, by ``range_rule`` (`fpp_ml_bench.depth.RangeRule`);
+    ``uses_ground_truth_mask`` when it was given which of their pixels are object (for example an
+    input that is black outside the object), ``uses_ground_truth_order`` when it was given their
+    true fringe orders; defaults of these three are never written, so that files without the keys
+    stay as they are. ``learned_from`` is absent where it is unknown. ``predicted`` says what
+    ``fpp-bench predict`` read, so that fpp-eval finds it; a result does not repeat it.
+    ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source``
+    beside it."""
 
-    SPARSE = ("nodata", "range_rule", "uses_ground_truth_mask", "uses_ground_truth_order", "learned_from", "predicted")
+    SPARSE = (
+        "nodata",
+        "range_rule",
+        "uses_ground_truth_mask",
+        "uses_ground_truth_order",
+        "learned_from",
+        "predicted",
+    )
 
     name: Text
     method: Text
@@ -82,23 +95,40 @@ class Submission(SparseModel):
         if len(set(self.frames_used)) != len(self.frames_used):
             raise ValueError("frames_used names a frame twice")
         if self.units == "normalised" and not self.uses_ground_truth_range:
-            why = "normalised depth only becomes mm through the range of the very samples it is scored on"
+            why = (
+                "normalised depth only becomes mm through the range of the very samples it is "
+                "scored on"
+            )
             needs = "units: normalised needs uses_ground_truth_range: true"
             raise ValueError(f"{needs}, for {why}; submit mm for the metric track")
         if self.range_rule != "object" and self.units != "normalised":
-            raise ValueError("range_rule is that of normalised depth, so units must be normalised; remove it")
+            raise ValueError(
+                "range_rule is that of normalised depth, so units must be normalised; remove it"
+            )
         if self.png_mm_per_level is not None and self.units != "mm":
             raise ValueError("png_mm_per_level gives PNG levels in mm, so units must be mm")
-        if self.seconds_per_sample is not None and (self.seconds_source is None or self.hardware is None):
-            raise ValueError("seconds_per_sample needs seconds_source and hardware beside it, or null when unknown")
+        if self.seconds_per_sample is not None and (
+            self.seconds_source is None or self.hardware is None
+        ):
+            raise ValueError(
+                "seconds_per_sample needs seconds_source and hardware beside it, or null when "
+                "unknown"
+            )
         if self.timing is not None and self.timing.frames != len(self.frames_used):
-            raise ValueError("timing.frames is not the number of frames_used; time this very method")
+            raise ValueError(
+                "timing.frames is not the number of frames_used; time this very method"
+            )
         return self
 
     @property
     def track(self) -> Track:
-        """``metric``, or what of the scored samples' ground truth the method was given: range, mask, fringe order."""
-        given = [name for name in ("range", "mask", "order") if getattr(self, f"uses_ground_truth_{name}")]
+        """``metric``, or what of the scored samples' ground truth the method was given: range,
+        mask, fringe order."""
+        given = [
+            name
+            for name in ("range", "mask", "order")
+            if getattr(self, f"uses_ground_truth_{name}")
+        ]
         return cast(Track, f"oracle {' + '.join(given)}" if given else "metric")
 
     def to_yaml(self) -> str:
@@ -108,12 +138,14 @@ class Submission(SparseModel):
 
 
 def read_submission(folder: Path) -> Submission:
-    """The checked ``submission.yaml`` of a predictions folder; SubmissionError names the file and the key."""
+    """The checked ``submission.yaml`` of a predictions folder; SubmissionError names the file and
+    the key."""
     return check_submission(folder, read_plain(folder))
 
 
 def check_submission(folder: Path, content: dict[Any, Any]) -> Submission:
-    """``content`` of the folder's ``submission.yaml`` as the model; SubmissionError as `read_submission`."""
+    """``content`` of the folder's ``submission.yaml`` as the model; SubmissionError as
+    `read_submission`."""
     return validate(Submission, content, folder / SUBMISSION_FILE, "submission description")
 
 
@@ -153,8 +185,8 @@ seconds_per_sample: null     # median time for one sample; a number needs the ne
 
 
 def write_template(folder: Path) -> Path:
-    """Write `TEMPLATE` as ``submission.yaml`` into ``folder``, made if absent; its path. SubmissionError where there is
-    one already, or where it can't be written."""
+    """Write `TEMPLATE` as ``submission.yaml`` into ``folder``, made if absent; its path.
+    SubmissionError where there is one already, or where it can't be written."""
     path = folder / SUBMISSION_FILE
     name = printable(str(path), 500)
     try:
@@ -163,7 +195,9 @@ def write_template(folder: Path) -> Path:
             file.write(TEMPLATE)
     except FileExistsError:
         where = name if folder.is_dir() else printable(str(folder), 500)
-        raise SubmissionError(f"{where} is there already and is not overwritten; give another folder") from None
+        raise SubmissionError(
+            f"{where} is there already and is not overwritten; give another folder"
+        ) from None
     except OSError as error:
         raise SubmissionError(f"{name} can't be written: {error.strerror}") from None
     return path

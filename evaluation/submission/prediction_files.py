@@ -1,5 +1,5 @@
-"""What a folder of predictions holds: the plain values of its description, the form of its files, and the files of
-samples, which are checked before memory is taken, and never unpickled."""
+"""What a folder of predictions holds: the plain values of its description, the form of its files,
+and the files of samples, which are checked before memory is taken, and never unpickled."""
 
 import hashlib
 import io
@@ -36,24 +36,30 @@ _MAX_BYTES = 65536
 
 
 def read_plain(folder: Path) -> dict[Any, Any]:
-    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked; else SubmissionError."""
+    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked; else
+    SubmissionError."""
     path = folder / SUBMISSION_FILE
     if path.is_symlink() or not path.is_file():
         found = "a symbolic link" if path.is_symlink() else "none"
         raise SubmissionError(
-            f"expected a file {printable(str(path), 500)} that describes the predictions, found {found}; fpp-bench "
+            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
+            f"{found}; fpp-bench "
             "predict writes one, PROTOCOL.md lists its keys"
         )
     return read_plain_file(path, "'name: My method'")
 
 
-def read_plain_file(path: Path, example: str, raised: type[FppBenchError] = SubmissionError) -> dict[Any, Any]:
-    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like. The
-    error ``raised`` names the file, what is wrong with it and what to do."""
+def read_plain_file(
+    path: Path, example: str, raised: type[FppBenchError] = SubmissionError
+) -> dict[Any, Any]:
+    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a
+    line looks like. The error ``raised`` names the file, what is wrong with it and what to do."""
     content = read_yaml(path, raised, "correct it, with short names and settings", _MAX_BYTES)
     if not isinstance(content, dict):
         file = printable(str(path), 500)
-        raise raised(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
+        raise raised(
+            f"{file}: expected keys and values like {example}, got {type(content).__name__}"
+        )
     return content
 
 
@@ -70,8 +76,8 @@ MapAndHash = tuple[NDArray[Any], str]
 
 @dataclass(frozen=True)
 class Listing:
-    """What a folder of predictions holds. ``form`` is one of `PER_SAMPLE` or `TABLES`; ``problems`` has a line for each
-    missing or extra entry; ``sigmas``: whether there are `SIGMA` files."""
+    """What a folder of predictions holds. ``form`` is one of `PER_SAMPLE` or `TABLES`; ``problems``
+    has a line for each missing or extra entry; ``sigmas``: whether there are `SIGMA` files."""
 
     folder: Path
     form: str
@@ -81,17 +87,21 @@ class Listing:
 
     def named(self, sample: str) -> str:
         """The name of a sample's prediction in messages: its file."""
-        return printable(f"{self.form}, sample {sample}" if self.form in TABLES else f"{sample}{self.form}")
+        return printable(
+            f"{self.form}, sample {sample}" if self.form in TABLES else f"{sample}{self.form}"
+        )
 
     def reader(
         self, size: tuple[int, int], png_mm_per_level: float | None, nodata: float | None = None
     ) -> Callable[[str], MapAndHash]:
-        """A function from a sample to its map ``size`` (H, W), 0 where the file holds ``nodata``, valid until the same
-        thread reads again, and the SHA-256 of its file. It may be called from several threads, and raises
-        PredictionError, without the file's name, for a file that is refused; a table is read here, and refused with its
-        name."""
+        """A function from a sample to its map ``size`` (H, W), 0 where the file holds ``nodata``,
+        valid until the same thread reads again, and the SHA-256 of its file. It may be called from
+        several threads, and raises PredictionError, without the file's name, for a file that is
+        refused; a table is read here, and refused with its name."""
         memory = local()
-        table = depth_maps(self.folder / self.form, self.present, size) if self.form in TABLES else None
+        table = (
+            depth_maps(self.folder / self.form, self.present, size) if self.form in TABLES else None
+        )
 
         def read(sample: str) -> MapAndHash:
             depth, digest = read_file(sample) if table is None else table(sample)
@@ -112,39 +122,57 @@ class Listing:
         return read
 
     def sigma_mm(self, sample: str, size: tuple[int, int]) -> NDArray[Any]:
-        """The `SIGMA` file of a sample, real floats (H, W) in mm; PredictionError, without the file's name, for any
-        other content."""
+        """The `SIGMA` file of a sample, real floats (H, W) in mm; PredictionError, without the
+        file's name, for any other content."""
         content = read_bounded(self.folder / f"{sample}{SIGMA}", _largest_npy(size))
         sigma_mm = parse_npy(content, size)
         low, high = float(sigma_mm.min()), float(sigma_mm.max())
         if low >= 0 and high <= LARGEST_MM:  # False for NaN
             return sigma_mm
         found = f"found {low:g} to {high:g}"
-        raise PredictionError(f"expected finite mm of 0 and more, {found}; write 0 where none is stated")
+        raise PredictionError(
+            f"expected finite mm of 0 and more, {found}; write 0 where none is stated"
+        )
 
 
 def predictions_folder(folder: str | Path) -> Path:
     """``folder``, if there is one; else PredictionError."""
     if not Path(folder).is_dir():
-        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
+        raise PredictionError(
+            f"expected a folder of predictions, found none at {printable(str(folder), 500)}"
+        )
     return Path(folder)
 
 
 def list_folder(folder: Path, dataset: "DatasetFolder | None" = None, split: str = "") -> Listing:
-    """What ``folder`` holds for the samples of a ``split``, or without a dataset for all that it has a file of their
-    own for: the form of most of its files, and every entry that is missing or extra."""
+    """What ``folder`` holds for the samples of a ``split``, or without a dataset for all that it
+    has a file of their own for: the form of most of its files, and every entry that is missing or
+    extra."""
     try:
         names = {entry.name for entry in os.scandir(folder)}
     except OSError as error:
         name = printable(str(folder))
-        raise PredictionError(f"the predictions folder {name} can't be read: {error.strerror}") from None
+        raise PredictionError(
+            f"the predictions folder {name} can't be read: {error.strerror}"
+        ) from None
     if dataset is not None:
         samples = dataset.samples(split)
     else:
-        stems = (name.removesuffix(suffix) for name in sorted(names) for suffix in PER_SAMPLE if name.endswith(suffix))
-        samples = list(dict.fromkeys(stem.removesuffix(SIGMA.removesuffix(".npy")) for stem in stems))
-    counts = {suffix: sum(f"{sample}{suffix}" in names for sample in samples) for suffix in PER_SAMPLE}
-    form = max(PER_SAMPLE, key=lambda suffix: counts[suffix])  # the first of equals: .npy where there is nothing
+        stems = (
+            name.removesuffix(suffix)
+            for name in sorted(names)
+            for suffix in PER_SAMPLE
+            if name.endswith(suffix)
+        )
+        samples = list(
+            dict.fromkeys(stem.removesuffix(SIGMA.removesuffix(".npy")) for stem in stems)
+        )
+    counts = {
+        suffix: sum(f"{sample}{suffix}" in names for sample in samples) for suffix in PER_SAMPLE
+    }
+    form = max(
+        PER_SAMPLE, key=lambda suffix: counts[suffix]
+    )  # the first of equals: .npy where there is nothing
     if counts[form] == 0:
         form = next((table for table in TABLES if table in names), form)
     files = {form: ""} if form in TABLES else {f"{sample}{form}": sample for sample in samples}
@@ -154,35 +182,58 @@ def list_folder(folder: Path, dataset: "DatasetFolder | None" = None, split: str
         splits = {} if dataset is None or suffix not in PER_SAMPLE else dataset.splits
         sample_split = next((other for other, names in splits.items() if stem in names), None)
         if sample_split and stem not in samples:
-            return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
+            return (
+                f"a sample of split {sample_split}, not of {split}: move it away or score that "
+                f"split"
+            )
         if name == UNFINISHED_FILE:
             return "a stopped fpp-bench predict left it: run the same command again, it continues"
         if sample_split or name in TABLES:
-            return f"the other predictions are {form if form in TABLES else form + ' files'}: keep one form"
+            return (
+                f"the other predictions are {form if form in TABLES else form + ' files'}: keep "
+                f"one form"
+            )
         return "remove it"
 
-    problems = [f"{name}: is missing; write one for each sample" for name in files if name not in names]
+    problems = [
+        f"{name}: is missing; write one for each sample" for name in files if name not in names
+    ]
     uncertain = {f"{sample}{SIGMA}" for sample in samples}
     if sigmas := bool(uncertain & names):
-        problems += [f"{name}: is missing; write one for each sample, or none" for name in sorted(uncertain - names)]
+        problems += [
+            f"{name}: is missing; write one for each sample, or none"
+            for name in sorted(uncertain - names)
+        ]
     extra = sorted(names - {*files, *uncertain, SUBMISSION_FILE, REPORTS_FILE, LOCK_FILE})
     problems += [f"{printable(name)}: is extra ({hint(name)})" for name in extra]
-    present = samples if form in TABLES else [sample for name, sample in files.items() if name in names]
+    present = (
+        samples if form in TABLES else [sample for name, sample in files.items() if name in names]
+    )
     return Listing(folder, form, problems, present, sigmas)
 
 
 HEADER_BYTES = 16384
-# NumPy parses a header through `ast`, whose recursion counter all threads share (CPython 3.11): two at once may fail.
+# NumPy parses a header through `ast`, whose recursion counter all threads share (CPython 3.11): two
+# at once may fail.
 _PARSING = Lock()
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-_NO_HEADER = (ValueError, TypeError, SyntaxError, TokenError, KeyError, RecursionError, MemoryError, OverflowError)
+_NO_HEADER = (
+    ValueError,
+    TypeError,
+    SyntaxError,
+    TokenError,
+    KeyError,
+    RecursionError,
+    MemoryError,
+    OverflowError,
+)
 
 
 def read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
-    """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored. ``size`` is the
-    expected (H, W). The array is a view of a buffer that the thread keeps in ``memory``, valid until its next read.
-    Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a real float
-    dtype."""
+    """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes
+    scored. ``size`` is the expected (H, W). The array is a view of a buffer that the thread keeps
+    in ``memory``, valid until its next read. Raises PredictionError, without the file's name, for
+    anything but a plain .npy of that size and a real float dtype."""
     if not hasattr(memory, "buffer"):
         memory.buffer = bytearray(_largest_npy(size))
     view = memoryview(memory.buffer)
@@ -197,7 +248,8 @@ def _largest_npy(size: tuple[int, int]) -> int:
 
 
 def declared_size(path: Path) -> tuple[int, int] | None:
-    """The size (H, W) that a .npy, .npz or .png file states; None where it states none. Nothing else is checked."""
+    """The size (H, W) that a .npy, .npz or .png file states; None where it states none. Nothing
+    else is checked."""
     with suppress(OSError, zipfile.BadZipFile, IndexError, *_NO_HEADER):
         with opened(path) as (stream, length):
             head = stream.read(min(HEADER_BYTES, length))
@@ -213,12 +265,15 @@ def declared_size(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def parse_npy(content: bytes | memoryview, size: tuple[int, int], length: int | None = None) -> NDArray[Any]:
-    """The array (H, W) in the bytes of a .npy file, a view; ``length``: that of the file where ``content`` may be its
-    beginning only. PredictionError as `read_npy`."""
+def parse_npy(
+    content: bytes | memoryview, size: tuple[int, int], length: int | None = None
+) -> NDArray[Any]:
+    """The array (H, W) in the bytes of a .npy file, a view; ``length``: that of the file where
+    ``content`` may be its beginning only. PredictionError as `read_npy`."""
     if content[:4] == b"PK\x03\x04":
         raise PredictionError(
-            "is a zip archive (np.savez?) under the name .npy; write it with np.save, or name it .npz"
+            "is a zip archive (np.savez?) under the name .npy; write it with np.save, or name it "
+            ".npz"
         )
     stream = io.BytesIO(content[:HEADER_BYTES])
     try:
@@ -227,9 +282,13 @@ def parse_npy(content: bytes | memoryview, size: tuple[int, int], length: int | 
             with _PARSING:
                 shape, fortran, dtype = read(stream)
     except _NO_HEADER:
-        raise PredictionError("is no .npy file, or its header is damaged; write it with np.save") from None
+        raise PredictionError(
+            "is no .npy file, or its header is damaged; write it with np.save"
+        ) from None
     if read is None:
-        raise PredictionError(f"has .npy format version {version}; expected 1.0 or 2.0, write it with np.save")
+        raise PredictionError(
+            f"has .npy format version {version}; expected 1.0 or 2.0, write it with np.save"
+        )
     _check_array(dtype, shape, size)
     start, length = stream.tell(), len(content) if length is None else length
     expected = start + size[0] * size[1] * dtype.itemsize
@@ -237,19 +296,28 @@ def parse_npy(content: bytes | memoryview, size: tuple[int, int], length: int | 
         problem = "is truncated" if length < expected else "has foreign bytes after the array"
         raise PredictionError(f"{problem}: expected {expected} bytes, got {length}; write it again")
     if len(content) != length:
-        raise PredictionError(f"ended early: expected {length} bytes, got {len(content)}; write it again")
+        raise PredictionError(
+            f"ended early: expected {length} bytes, got {len(content)}; write it again"
+        )
     flat = np.frombuffer(content, dtype=dtype, count=size[0] * size[1], offset=start)
     return flat.reshape(size, order="F" if fortran else "C")
 
 
 def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Refuse anything but a real float map of ``size``: objects, complex numbers, whole numbers, other shapes."""
+    """Refuse anything but a real float map of ``size``: objects, complex numbers, whole numbers,
+    other shapes."""
     if dtype.hasobject:
-        raise PredictionError("holds pickled Python objects, which are never opened; save a float32 array")
+        raise PredictionError(
+            "holds pickled Python objects, which are never opened; save a float32 array"
+        )
     if dtype.kind != "f" or dtype.itemsize not in (2, 4, 8):
         wrap = ": whole numbers round depth, and wrap around where it does not fit; save as float32"
-        why = {"c": " (complex); save its real depth", "i": wrap, "u": wrap}.get(dtype.kind, "; save as float32")
-        raise PredictionError(f"expected float16, float32 or float64, got {printable(str(dtype), 80)}{why}")
+        why = {"c": " (complex); save its real depth", "i": wrap, "u": wrap}.get(
+            dtype.kind, "; save as float32"
+        )
+        raise PredictionError(
+            f"expected float16, float32 or float64, got {printable(str(dtype), 80)}{why}"
+        )
     if problem := shape_problem(shape, size):
         raise PredictionError(problem)
 
@@ -259,28 +327,45 @@ _ENCRYPTED = 0x1
 
 
 def parse_npz(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
-    """The array (H, W) in an .npz archive; PredictionError as `read_npy`. The array may have any name. The size that
-    the archive declares is checked before a byte is unpacked, and unpacking stops at the limit even where the archive
-    declares a wrong size."""
+    """The array (H, W) in an .npz archive; PredictionError as `read_npy`. The array may have any
+    name. The size that the archive declares is checked before a byte is unpacked, and unpacking
+    stops at the limit even where the archive declares a wrong size."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return parse_npy(_unpacked(archive, _largest_npy(size)), size)
     except PredictionError:
         raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, RuntimeError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        NotImplementedError,
+        ValueError,
+        RuntimeError,
+    ) as error:
         reason = printable(str(error), 80)
-        raise PredictionError(f"is no .npz archive, or damaged ({reason}); write it with np.savez") from None
+        raise PredictionError(
+            f"is no .npz archive, or damaged ({reason}); write it with np.savez"
+        ) from None
 
 
 def _unpacked(archive: zipfile.ZipFile, largest: int) -> bytes:
     members = archive.infolist()
     if len(members) != 1:
         names = printable(", ".join(member.filename for member in members[:5]), 120)
-        raise PredictionError(f"holds {len(members)} arrays ({names}), expected one; save the depth alone")
+        raise PredictionError(
+            f"holds {len(members)} arrays ({names}), expected one; save the depth alone"
+        )
     member = members[0]
     name = printable(member.filename, 80)
-    if member.filename.startswith(("/", "\\")) or ".." in member.filename or "\\" in member.filename:
-        raise PredictionError(f"holds the path {name}, which leads out of the archive; write it with np.savez")
+    if (
+        member.filename.startswith(("/", "\\"))
+        or ".." in member.filename
+        or "\\" in member.filename
+    ):
+        raise PredictionError(
+            f"holds the path {name}, which leads out of the archive; write it with np.savez"
+        )
     if not member.filename.endswith(".npy"):
         raise PredictionError(f"holds {name}, expected one .npy array; write it with np.savez")
     if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
@@ -292,7 +377,9 @@ def _unpacked(archive: zipfile.ZipFile, largest: int) -> bytes:
     with archive.open(member) as stream:
         content = stream.read(largest + 1)
     if len(content) > largest:
-        raise PredictionError(f"{name} unpacks to more than the {member.file_size} bytes it says; write it again")
+        raise PredictionError(
+            f"{name} unpacks to more than the {member.file_size} bytes it says; write it again"
+        )
     return content
 
 
@@ -301,21 +388,29 @@ _PNG_ADVICE = "write 16-bit grey levels (cv2.imwrite of a uint16 array)"
 
 
 def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None) -> NDArray[Any]:
-    """Depth (H, W) float64 in mm in a 16-bit PNG; PredictionError as `read_npy`. The header is checked before the image
-    is decoded, every checksum and the unpacked length (`containers.parse_image`), too. A level of 65535 is refused:
-    there a depth that does not fit was cut off."""
+    """Depth (H, W) float64 in mm in a 16-bit PNG; PredictionError as `read_npy`. The header is
+    checked before the image is decoded, every checksum and the unpacked length
+    (`containers.parse_image`), too. A level of 65535 is refused: there a depth that does not fit
+    was cut off."""
     if mm_per_level is None:
-        raise PredictionError("has no scale: give png_mm_per_level, the mm of one level, in submission.yaml")
+        raise PredictionError(
+            "has no scale: give png_mm_per_level, the mm of one level, in submission.yaml"
+        )
     header = png_header(content)
     if header is None:
         raise PredictionError(f"is no PNG file; {_PNG_ADVICE}")
     if problem := shape_problem(header.size, size):
         raise PredictionError(problem)
     if header[1:] != (16, PNG_GREY, 0):
-        kind = f"{header.bits} bits per channel, colour type {header.colour}, interlacing {header.interlaced}"
+        kind = (
+            f"{header.bits} bits per channel, colour type {header.colour}, interlacing "
+            f"{header.interlaced}"
+        )
         raise PredictionError(f"has {kind}; expected 16, 0 and 0: {_PNG_ADVICE}")
     try:
-        image = parse_image(content, len(content) + 2 * size[0] * size[1], unpacked=size[0] * (2 * size[1] + 1))
+        image = parse_image(
+            content, len(content) + 2 * size[0] * size[1], unpacked=size[0] * (2 * size[1] + 1)
+        )
     except PredictionError as error:
         raise PredictionError(f"{error}; {_PNG_ADVICE}") from None
     if image.transparent or image.levels.shape != size:
@@ -323,7 +418,8 @@ def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None)
     if image.levels.max() == PNG_LEVELS:
         cut_off = f"where depth above {PNG_LEVELS * mm_per_level:g} mm is cut off"
         raise PredictionError(
-            f"reaches level {PNG_LEVELS}, {cut_off}; use a larger png_mm_per_level, and 0 for no surface"
+            f"reaches level {PNG_LEVELS}, {cut_off}; use a larger png_mm_per_level, and 0 for no "
+            f"surface"
         )
     return image.levels.astype(np.float64) * mm_per_level
 
@@ -343,16 +439,19 @@ _SLACK_BYTES, _SLACK_PER_SAMPLE = 1 << 20, 1 << 16
 _TABLE_ADVICE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
 
 
-def depth_maps(path: Path, samples: Sequence[str], size: tuple[int, int]) -> Callable[[str], MapAndHash]:
-    """A function from a sample to its map (H, W) and the SHA-256 of the file, an Arrow (IPC stream or file) or Parquet
-    table with the columns ``sample`` (text) and ``depth``, whose rows hold H lists of W floats, one list of H W floats,
-    or a tensor. PredictionError with the file's name. The whole table is held in memory: at most a float64 map per
-    sample."""
+def depth_maps(
+    path: Path, samples: Sequence[str], size: tuple[int, int]
+) -> Callable[[str], MapAndHash]:
+    """A function from a sample to its map (H, W) and the SHA-256 of the file, an Arrow (IPC stream
+    or file) or Parquet table with the columns ``sample`` (text) and ``depth``, whose rows hold H
+    lists of W floats, one list of H W floats, or a tensor. PredictionError with the file's name.
+    The whole table is held in memory: at most a float64 map per sample."""
     count, pixels = len(samples), size[0] * size[1]
     largest = count * (pixels * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
     try:
         content = read_bounded(path, largest)
-        # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
+        # Twice what is needed, so that an extra row is refused by its name and not by the size of
+        # the file.
         try:
             table = parse_table(content, 2 * largest, 2 * count * (pixels + 1))
         except PredictionError as error:
@@ -374,7 +473,9 @@ def _check_columns(schema: Any) -> None:
     """Refuse a ``pyarrow.Schema`` of other columns."""
     if sorted(schema.names) != ["depth", "sample"]:
         names = printable(", ".join(schema.names), 120)
-        raise PredictionError(f"holds the columns {names}; expected sample and depth: {_TABLE_ADVICE}")
+        raise PredictionError(
+            f"holds the columns {names}; expected sample and depth: {_TABLE_ADVICE}"
+        )
     name, declared = (schema.field(column).type for column in ("sample", "depth"))
     if str(name) not in ("string", "large_string"):
         raise PredictionError(f"column sample: expected text, got {name}; {_TABLE_ADVICE}")
@@ -385,7 +486,8 @@ def _check_columns(schema: Any) -> None:
         given = f"got {printable(str(declared), 80)}"
         why = "whole numbers wrap around, other types are not depth"
         raise PredictionError(
-            f"column depth: expected lists of float16, float32 or float64, {given}; {why}: {_TABLE_ADVICE}"
+            f"column depth: expected lists of float16, float32 or float64, {given}; {why}: "
+            f"{_TABLE_ADVICE}"
         )
 
 
@@ -395,7 +497,11 @@ def _item_type(value: Any) -> Any:
 
     if isinstance(value, pa.BaseExtensionType):
         return value.storage_type
-    if pa.types.is_list(value) or pa.types.is_large_list(value) or pa.types.is_fixed_size_list(value):
+    if (
+        pa.types.is_list(value)
+        or pa.types.is_large_list(value)
+        or pa.types.is_fixed_size_list(value)
+    ):
         return value.value_type
     return None
 
@@ -405,9 +511,13 @@ def _rows(names: list[str], samples: Sequence[str]) -> dict[str, int]:
     rows = {name: row for row, name in enumerate(names)}
     problems = [f"lacks the sample {sample}" for sample in samples if sample not in rows]
     problems += [
-        f"holds {printable(name)}, which is no sample of this split" for name in rows if name not in set(samples)
+        f"holds {printable(name)}, which is no sample of this split"
+        for name in rows
+        if name not in set(samples)
     ]
-    problems += [f"holds the sample {printable(name)} twice" for name in rows if names.count(name) > 1]
+    problems += [
+        f"holds the sample {printable(name)} twice" for name in rows if names.count(name) > 1
+    ]
     if problems:
         raise PredictionError(f"{'; '.join(problems[:20])}; write one row for each sample")
     return rows
@@ -424,10 +534,15 @@ def _depth_map(values: Any, size: tuple[int, int]) -> NDArray[Any]:
             break
         lengths = values.value_lengths().unique().to_pylist()
         if len(lengths) != 1:
-            raise PredictionError(f"expected rows of one length, got {len(lengths)} different ones; write H x W values")
+            raise PredictionError(
+                f"expected rows of one length, got {len(lengths)} different ones; write H x W "
+                f"values"
+            )
         shape += lengths
         values = values.flatten()
     if shape != [size[0] * size[1]] and (problem := shape_problem(shape, size)):
         raise PredictionError(problem)
     dtype = np.dtype(values.type.to_pandas_dtype())
-    return np.frombuffer(values.buffers()[1], dtype, len(values), values.offset * dtype.itemsize).reshape(size)
+    return np.frombuffer(
+        values.buffers()[1], dtype, len(values), values.offset * dtype.itemsize
+    ).reshape(size)

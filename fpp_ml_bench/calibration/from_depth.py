@@ -1,12 +1,15 @@
-"""The projector from views whose depth is known: pose, intrinsics and fringe pitch, with the camera given.
+"""The projector from views whose depth is known: pose, intrinsics and fringe pitch, with the camera
+given.
 
-Phase and depth alone determine the projector in periods (`projection`): all but the size of its pixels. The pitch in
-px then follows from one more fact: the pitch itself, the focal length in px, or (by default) the pattern's size, with
-square pixels and the principal point in the pattern's middle, (W - 1) / 2 px. A pitch that is within its uncertainty a
-whole number of px, or fits the pattern a whole number of times, is taken as that; also one that is a little farther off
+Phase and depth alone determine the projector in periods (`projection`): all but the size of its
+pixels. The pitch in px then follows from one more fact: the pitch itself, the focal length in px,
+or (by default) the pattern's size, with square pixels and the principal point in the pattern's
+middle, (W - 1) / 2 px. A pitch that is within its uncertainty a whole number of px, or fits the
+pattern a whole number of times, is taken as that; also one that is a little farther off
 (`_PITCH_SHARE`), unless the fit gets worse by it.
 
-The phase's origin is the centre of pixel 0, as in the patterns; another origin would shift the principal point.
+The phase's origin is the centre of pixel 0, as in the patterns; another origin would shift the
+principal point.
 """
 
 import math
@@ -39,13 +42,15 @@ from fpp_ml_bench.optics.sequence import AXES
 
 LEAST_PX = 200
 MOST_SIGMA_PX = 1.5
-"""Robust standard deviation above which the frames are not those of the depth: the decoder's limit for a pixel."""
+"""Robust standard deviation above which the frames are not those of the depth: the decoder's limit
+for a pixel."""
 MOST_RELATIVE_ERROR = 0.02
 """Of the pitch and the focal length: above it, the views don't determine them."""
 MOST_OFF_SQUARE = 0.01
 _SIGMAS = 3.0
 _PITCH_SHARE, _PITCH_PX = 0.005, 0.25
-"""A pitch this near to a whole one may be it, whatever its standard error: the part that noise does not explain."""
+"""A pitch this near to a whole one may be it, whatever its standard error: the part that noise does
+not explain."""
 _MOST_APART_PX = 0.5
 _MOST_WORSE, _WORSE_PX = 1.05, 1e-3
 _SMALLEST_PX = 1e-4
@@ -56,9 +61,10 @@ Pair = tuple[float, float]
 
 
 class Residual(NamedTuple):
-    """Depth of the fitted rig from the phases minus the depth given, of ``pixels``: median, robust standard deviation
-    (1.4826 MAD) and RMS in mm, and the RMS distance of projected from measured coordinates in projector px. At
-    ``missing`` further pixels the rig gives no depth. NaN where there is no pixel."""
+    """Depth of the fitted rig from the phases minus the depth given, of ``pixels``: median, robust
+    standard deviation (1.4826 MAD) and RMS in mm, and the RMS distance of projected from measured
+    coordinates in projector px. At ``missing`` further pixels the rig gives no depth. NaN where
+    there is no pixel."""
 
     name: str
     pixels: int
@@ -71,8 +77,9 @@ class Residual(NamedTuple):
 
 @dataclass(frozen=True)
 class DepthFit:
-    """What a fit found: residuals by view and of all views together; the pitch as measured before it was rounded, and
-    its standard error, (vertical, horizontal) in px; and what the pitch was taken from, a sentence."""
+    """What a fit found: residuals by view and of all views together; the pitch as measured before
+    it was rounded, and its standard error, (vertical, horizontal) in px; and what the pitch was
+    taken from, a sentence."""
 
     views: tuple[Residual, ...]
     total: Residual
@@ -91,20 +98,24 @@ def fit_projector(
     lens: bool = False,
     most_px: int = MOST_PX,
 ) -> tuple[Rig, DepthFit]:
-    """The rig whose projector gives the views' depth from their phases, by robust least squares over all of them.
+    """The rig whose projector gives the views' depth from their phases, by robust least squares
+    over all of them.
 
-    Of ``rig`` the camera, the sequence and the distances are kept; the working range is widened to hold the depths.
-    ``size``: the projector's (width, height) in px, by default that of ``rig``. ``pitch_px``, (vertical, horizontal),
-    or ``focal_px``: what is known of the projector; the principal point is then fitted. ``lens``: fit the projector's
-    first radial term too. Raises `CalibrationError` where the views don't determine a projector or no projector
-    explains them."""
+    Of ``rig`` the camera, the sequence and the distances are kept; the working range is widened to
+    hold the depths. ``size``: the projector's (width, height) in px, by default that of ``rig``.
+    ``pitch_px``, (vertical, horizontal), or ``focal_px``: what is known of the projector; the
+    principal point is then fitted. ``lens``: fit the projector's first radial term too. Raises
+    `CalibrationError` where the views don't determine a projector or no projector explains them."""
     if pitch_px is not None and focal_px is not None:
-        raise CalibrationError("pitch_px and focal_px: expected one of them, got both; each follows from the other")
+        raise CalibrationError(
+            "pitch_px and focal_px: expected one of them, got both; each follows from the other"
+        )
     views = list(views)
     count = sum(len(view.depth_mm) for view in views)
     if count < LEAST_PX:
         raise CalibrationError(
-            f"expected at least {LEAST_PX} pixels with depth and with both phases, got {count} in {len(views)} views; "
+            f"expected at least {LEAST_PX} pixels with depth and with both phases, got {count} in "
+            f"{len(views)} views; "
             "the Gray code must count half periods, and the depth must be that of the frames"
         )
     width, height = size or (rig.projector.width, rig.projector.height)
@@ -129,34 +140,47 @@ def fit_projector(
     _check_fit(fitted, first)
     result = _rig_of(fitted, rig, (width, height), measured.points_m[2] * MM_PER_M)
     differences = [_differences(view, result) for view in views]
-    residuals = tuple(_residual(view.name, values) for view, values in zip(views, differences, strict=True))
+    residuals = tuple(
+        _residual(view.name, values) for view, values in zip(views, differences, strict=True)
+    )
     total = _residual("all", np.concatenate(differences, axis=1))
     errors = first.errors.get("pitch_u", 0.0), first.errors.get("pitch_v", 0.0)
     return result, DepthFit(residuals, total, first.pair("pitch_u", "pitch_v"), errors, pitch_from)
 
 
-def _with_middle(fit: Callable[..., Projector], start: Projection, size: tuple[int, int]) -> Projector:
-    """The fit with square pixels and the principal point in the middle of a pattern of ``size`` px (W, H)."""
+def _with_middle(
+    fit: Callable[..., Projector], start: Projection, size: tuple[int, int]
+) -> Projector:
+    """The fit with square pixels and the principal point in the middle of a pattern of ``size`` px
+    (W, H)."""
     middle = (np.array(size) - 1) / 2
     if not (start.centre > 0).all():
         raise CalibrationError(
-            f"the principal point lies outside the pattern (at {start.centre[0]:.3g} and {start.centre[1]:.3g} "
-            "periods), so the pitch can't be taken from the pattern's middle; give the pitch or the focal length"
+            f"the principal point lies outside the pattern (at {start.centre[0]:.3g} and "
+            f"{start.centre[1]:.3g} "
+            "periods), so the pitch can't be taken from the pattern's middle; give the pitch or "
+            "the focal length"
         )
     free = fit(_values(start, middle / start.centre), {"focal", "aspect"}, PITCH)
     aspect, error = free.values["aspect"], free.errors["aspect"]
     if abs(aspect - 1) > max(MOST_OFF_SQUARE, _SIGMAS * error):
         raise CalibrationError(
-            f"with the principal point in the middle of {size[0]} x {size[1]} px, the pixels would not be square "
-            f"(aspect {aspect:.4f} +- {error:.4f}). Give the projector's size, its pitch or its focal length"
+            f"with the principal point in the middle of {size[0]} x {size[1]} px, the pixels would "
+            f"not be square "
+            f"(aspect {aspect:.4f} +- {error:.4f}). Give the projector's size, its pitch or its "
+            f"focal length"
         )
     return fit(free.values | {"aspect": 1.0}, {"focal"}, PITCH)
 
 
 def _rounded(
-    fit: Callable[..., Projector], found: Projector, size: tuple[int, int], centre: Set[str] = frozenset()
+    fit: Callable[..., Projector],
+    found: Projector,
+    size: tuple[int, int],
+    centre: Set[str] = frozenset(),
 ) -> tuple[Projector, str]:
-    """The fit with a whole pitch where the found one may be it, else the found one; and words that say so."""
+    """The fit with a whole pitch where the found one may be it, else the found one; and words that
+    say so."""
     pitches, words, certain = {}, [], True
     for name, length in zip(("pitch_u", "pitch_v"), size, strict=True):
         if whole := _whole_pitch(found.values[name], found.errors[name], length):
@@ -172,10 +196,13 @@ def _rounded(
 
 
 def _whole_pitch(pitch_px: float, error_px: float, length_px: int) -> tuple[float, str] | None:
-    """The whole number of px, or the whole part of the pattern's length, that a measured pitch may be, and its name."""
+    """The whole number of px, or the whole part of the pattern's length, that a measured pitch may
+    be, and its name."""
     noise_px = _SIGMAS * error_px + _SMALLEST_PX
     whole, part = float(round(pitch_px)), length_px / round(length_px / pitch_px)
-    if noise_px < _MOST_APART_PX and abs(whole - pitch_px) <= max(noise_px, min(_PITCH_SHARE * pitch_px, _PITCH_PX)):
+    if noise_px < _MOST_APART_PX and abs(whole - pitch_px) <= max(
+        noise_px, min(_PITCH_SHARE * pitch_px, _PITCH_PX)
+    ):
         return whole, "whole px"
     # Parts of the pattern lie closer together, so that one of them is near any pitch.
     next_part = length_px / (length_px / part + 1)
@@ -187,7 +214,9 @@ def _whole_pitch(pitch_px: float, error_px: float, length_px: int) -> tuple[floa
 def _values(start: Projection, pitch_px: Pair | NDArray[np.float64]) -> dict[str, float]:
     """The projector's numbers, given the pitch that the projection is in."""
     focal, centre = start.focal * pitch_px, start.centre * pitch_px
-    numbers = np.concatenate([start.turn, start.t, [focal[0], focal[1] / focal[0]], centre, pitch_px, [0.0]])
+    numbers = np.concatenate(
+        [start.turn, start.t, [focal[0], focal[1] / focal[0]], centre, pitch_px, [0.0]]
+    )
     return dict(zip(NAMES, numbers.tolist(), strict=True))
 
 
@@ -196,18 +225,23 @@ def _check_fit(found: Projector, first: Projector) -> None:
         value, error = first.values[name], first.errors.get(name, 0.0)
         if not error <= MOST_RELATIVE_ERROR * abs(value):
             raise CalibrationError(
-                f"the views determine the projector's {name.replace('_', ' of ')} only to {value:.2f} +- {error:.2g} "
+                f"the views determine the projector's {name.replace('_', ' of ')} only to "
+                f"{value:.2f} +- {error:.2g} "
                 "px; give views at more places and distances, or the pitch"
             )
     if not found.sigma_px <= MOST_SIGMA_PX:
         raise CalibrationError(
-            f"the best projector misses the phases by {found.sigma_px:.2f} px (robust standard deviation), expected at "
-            f"most {MOST_SIGMA_PX} px: the depth is not that of these frames, or not by this camera; check both, and "
+            f"the best projector misses the phases by {found.sigma_px:.2f} px (robust standard "
+            f"deviation), expected at "
+            f"most {MOST_SIGMA_PX} px: the depth is not that of these frames, or not by this "
+            f"camera; check both, and "
             "the frame order"
         )
 
 
-def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArray[np.float64]) -> Rig:
+def _rig_of(
+    found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArray[np.float64]
+) -> Rig:
     """``rig`` with the projector found, its distances widened to hold ``depths_mm``."""
     focal, aspect = found.pair("focal", "aspect")
     c_u, c_v = found.pair("c_u", "c_v")
@@ -218,7 +252,9 @@ def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArra
     try:
         return replace(
             rig,
-            projector=Pinhole(*size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)),
+            projector=Pinhole(
+                *size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)
+            ),
             rotation=tuple(map(tuple, rotation_matrix(tuple(turn)).tolist())),
             translation_m=(x, y, z),
             pitch_vertical_px=found.values["pitch_u"],
@@ -227,11 +263,14 @@ def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArra
             background_m=max(rig.background_m, far / MM_PER_M + _BEHIND_M),
         )
     except RigError as error:
-        raise CalibrationError(f"the projector found is not one of this sequence and size: {error}") from error
+        raise CalibrationError(
+            f"the projector found is not one of this sequence and size: {error}"
+        ) from error
 
 
 def _differences(view: DepthView, rig: Rig) -> NDArray[np.float64]:
-    """Depth by the rig minus the depth given in mm, and projected minus measured u and v in px, (3, n)."""
+    """Depth by the rig minus the depth given in mm, and projected minus measured u and v in px, (3,
+    n)."""
     pitches = np.array([[rig.pitch(direction)] for direction in AXES])
     (u_px, v_px), weights = view.periods * pitches, (view.modulation / pitches) ** 2
     x, y = view.rays
@@ -247,5 +286,7 @@ def _residual(name: str, differences: NDArray[np.float64]) -> Residual:
         return Residual(name, 0, missing, *[math.nan] * 4)
     median = float(np.median(depth_mm))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(depth_mm - median)))
-    rms_mm, rms_px = (math.sqrt(float(np.mean(squares))) for squares in (depth_mm**2, u_px**2 + v_px**2))
+    rms_mm, rms_px = (
+        math.sqrt(float(np.mean(squares))) for squares in (depth_mm**2, u_px**2 + v_px**2)
+    )
     return Residual(name, len(depth_mm), missing, median, sigma, rms_mm, rms_px)

@@ -1,14 +1,15 @@
-"""What the captures of a board tell: projector coordinates of its points, fitted to what the camera sees of the
-projector round each of them, and the response of projector and camera together.
+"""What the captures of a board tell: projector coordinates of its points, fitted to what the camera
+sees of the projector round each of them, and the response of projector and camera together.
 
-Near a point of a flat board, camera and projector see each other through a homography (Moreno and Taubin, Simple,
-accurate, and robust projector-camera calibration, 3DIMPVT 2012). It is fitted to the decoded pixels of a window; dark
-squares that were not decoded are left out, wrong orders and edges get no weight.
+Near a point of a flat board, camera and projector see each other through a homography (Moreno and
+Taubin, Simple, accurate, and robust projector-camera calibration, 3DIMPVT 2012). It is fitted to
+the decoded pixels of a window; dark squares that were not decoded are left out, wrong orders and
+edges get no weight.
 
-The response is by how much light follows the pattern's level: at a pixel of the board the frames show ``a + b g(p_n)``
-of the pattern's levels p_n there, with the response ``g(p) = (p / 255)^gamma`` that all pixels share. The levels come
-from the projector coordinate, which is averaged over more than a period: the errors that a response itself causes are
-periodic, and cancel.
+The response is by how much light follows the pattern's level: at a pixel of the board the frames
+show ``a + b g(p_n)`` of the pattern's levels p_n there, with the response ``g(p) = (p /
+255)^gamma`` that all pixels share. The levels come from the projector coordinate, which is averaged
+over more than a period: the errors that a response itself causes are periodic, and cancel.
 """
 
 from collections.abc import Sequence
@@ -31,7 +32,8 @@ WINDOW_SHARE = 0.5
 LEAST_RADIUS_PX, LARGEST_RADIUS_PX = 4.0, 24.0
 FEWEST_PIXELS = 24
 LEAST_SPREAD = 0.15
-"""Smallest standard deviation of the pixels' positions along any direction, in window radii: 0.5 for a full disc."""
+"""Smallest standard deviation of the pixels' positions along any direction, in window radii: 0.5
+for a full disc."""
 LARGEST_OFFSET = 0.4
 """Of the pixels' centroid from the point, in window radii: beyond, they lie on one side of it."""
 TUKEY = 6.0
@@ -45,13 +47,14 @@ MOST_RESPONSE_PIXELS = 4000
 AVERAGED_PERIODS = 1.5
 """Width of the average in periods of the finest fringes."""
 BRIGHT_SHARE = 0.5
-"""Only pixels at least so bright, of the brightest on the board: the board's print has edges where it is dark."""
+"""Only pixels at least so bright, of the brightest on the board: the board's print has edges where
+it is dark."""
 
 
 class ProjectorPoints(NamedTuple):
-    """Projector coordinates ``points_px`` (n, 2), their standard uncertainty ``sigma_px`` (n, 2), the change of the
-    coordinates with the image position ``jacobian`` (n, 2, 2), float64, NaN where there are none; ``reasons``: why not,
-    by the point's number."""
+    """Projector coordinates ``points_px`` (n, 2), their standard uncertainty ``sigma_px`` (n, 2),
+    the change of the coordinates with the image position ``jacobian`` (n, 2, 2), float64, NaN where
+    there are none; ``reasons``: why not, by the point's number."""
 
     points_px: NDArray[np.float64]
     sigma_px: NDArray[np.float64]
@@ -60,7 +63,8 @@ class ProjectorPoints(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """A board pose as measured: image size (width, height), board points in the image and in the projector, px."""
+    """A board pose as measured: image size (width, height), board points in the image and in the
+    projector, px."""
 
     name: str
     size: tuple[int, int]
@@ -69,27 +73,40 @@ class Pose(NamedTuple):
 
 
 def measure_pose(
-    name: str, image: NDArray[np.uint8], u_px: NDArray[np.float64], v_px: NDArray[np.float64], board: Board
+    name: str,
+    image: NDArray[np.uint8],
+    u_px: NDArray[np.float64],
+    v_px: NDArray[np.float64],
+    board: Board,
 ) -> Pose:
-    """Find the ``board`` in the 8-bit ``image`` (H, W) of a pose, and the projector's columns and rows at its points
-    from the decoded maps ``u_px`` and ``v_px`` (H, W), NaN where not decoded. Raises `CalibrationError` naming the pose
-    where the board is not found, or image and maps differ in size."""
+    """Find the ``board`` in the 8-bit ``image`` (H, W) of a pose, and the projector's columns and
+    rows at its points from the decoded maps ``u_px`` and ``v_px`` (H, W), NaN where not decoded.
+    Raises `CalibrationError` naming the pose where the board is not found, or image and maps differ
+    in size."""
     for title, coordinates in (("columns", u_px), ("rows", v_px)):
         if coordinates.shape != image.shape:
             (h, w), got = image.shape[:2], " x ".join(map(str, coordinates.shape[::-1]))
-            raise CalibrationError(f"pose {name}: the image is {w} x {h} px, but the map of projector {title} {got} px")
+            raise CalibrationError(
+                f"pose {name}: the image is {w} x {h} px, but the map of projector {title} {got} px"
+            )
     corners = board.find(image, f"pose {name}")
-    return Pose(name, (image.shape[1], image.shape[0]), corners, projector_points(corners, u_px, v_px))
+    return Pose(
+        name, (image.shape[1], image.shape[0]), corners, projector_points(corners, u_px, v_px)
+    )
 
 
 def projector_points(
     corners_px: NDArray[np.float64], u_px: NDArray[np.float64], v_px: NDArray[np.float64]
 ) -> ProjectorPoints:
-    """Projector coordinates at image points (n, 2) from the maps of projector columns and rows (H, W) px, float64, NaN
-    where not decoded. The uncertainty is that of the fit, with the errors that neighbouring pixels share (fringe
-    harmonics, edges); errors of a whole window are not in it."""
+    """Projector coordinates at image points (n, 2) from the maps of projector columns and rows (H,
+    W) px, float64, NaN where not decoded. The uncertainty is that of the fit, with the errors that
+    neighbouring pixels share (fringe harmonics, edges); errors of a whole window are not in it."""
     n = len(corners_px)
-    points, sigma, jacobian = np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
+    points, sigma, jacobian = (
+        np.full((n, 2), np.nan),
+        np.full((n, 2), np.nan),
+        np.full((n, 2, 2), np.nan),
+    )
     reasons: dict[int, str] = {}
     radii = np.clip(WINDOW_SHARE * nearest_px(corners_px), LEAST_RADIUS_PX, LARGEST_RADIUS_PX)
     for i, (corner, radius) in enumerate(zip(corners_px, radii, strict=True)):
@@ -108,13 +125,18 @@ def projector_points(
 def _window(
     corner: NDArray, radius: float, u_px: NDArray, v_px: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """Positions (k, 2), in radii from the corner, and coordinates (k, 2) of the decoded pixels of a disc, and the
-    number of all its pixels."""
+    """Positions (k, 2), in radii from the corner, and coordinates (k, 2) of the decoded pixels of a
+    disc, and the number of all its pixels."""
     reach = int(np.ceil(radius))
     x0, y0 = np.rint(corner).astype(int)
-    rows, columns = slice(max(y0 - reach, 0), y0 + reach + 1), slice(max(x0 - reach, 0), x0 + reach + 1)
+    rows, columns = (
+        slice(max(y0 - reach, 0), y0 + reach + 1),
+        slice(max(x0 - reach, 0), x0 + reach + 1),
+    )
     u, v = u_px[rows, columns], v_px[rows, columns]
-    y, x = np.mgrid[rows.start : rows.start + u.shape[0], columns.start : columns.start + u.shape[1]]
+    y, x = np.mgrid[
+        rows.start : rows.start + u.shape[0], columns.start : columns.start + u.shape[1]
+    ]
     position = (np.stack([x, y], axis=-1) - corner) / radius
     disc = (position**2).sum(-1) <= 1
     decoded = disc & np.isfinite(u) & np.isfinite(v)
@@ -132,16 +154,22 @@ def _too_few(position: NDArray[np.float64], count: int) -> str | None:
     return None
 
 
-def _fit(position: NDArray[np.float64], coordinates: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Coordinates, uncertainty and Jacobian at the origin of the homography from ``position`` to ``coordinates``
-    (k, 2): first the sum of distances is made smallest, which wrong orders don't move, then Tukey's weights."""
+def _fit(
+    position: NDArray[np.float64], coordinates: NDArray[np.float64]
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Coordinates, uncertainty and Jacobian at the origin of the homography from ``position`` to
+    ``coordinates`` (k, 2): first the sum of distances is made smallest, which wrong orders don't
+    move, then Tukey's weights."""
     x, y = position.T
     shift = np.median(coordinates, axis=0)
     u, v = (coordinates - shift).T
     plane = np.stack([x, y, np.ones_like(x)], axis=-1)
     zero = np.zeros_like(plane)
     design = np.concatenate(
-        [np.hstack([plane, zero, -position * u[:, None]]), np.hstack([zero, plane, -position * v[:, None]])]
+        [
+            np.hstack([plane, zero, -position * u[:, None]]),
+            np.hstack([zero, plane, -position * v[:, None]]),
+        ]
     )
     target, weight, scale = np.concatenate([u, v]), np.ones(len(x)), np.ones(len(x))
     for step in range(20):
@@ -155,7 +183,9 @@ def _fit(position: NDArray[np.float64], coordinates: NDArray[np.float64]) -> tup
         if step < 8:
             new_weight = 1 / np.maximum(distance / sigma, 0.1)
         else:
-            new_weight = np.where(distance < TUKEY * sigma, (1 - (distance / (TUKEY * sigma)) ** 2) ** 2, 0.0)
+            new_weight = np.where(
+                distance < TUKEY * sigma, (1 - (distance / (TUKEY * sigma)) ** 2) ** 2, 0.0
+            )
         done = step > 9 and np.abs(new_weight - weight).max() < 1e-2
         if done:
             break
@@ -163,7 +193,9 @@ def _fit(position: NDArray[np.float64], coordinates: NDArray[np.float64]) -> tup
     # The own noise of the pixels, and what blocks of them have in common: the larger one.
     block = np.clip((position * 2 + 2).astype(int), 0, 3) @ [4, 1]
     scores = np.zeros((16, 8))
-    np.add.at(scores, np.tile(block, 2), design * (np.tile(weight / scale, 2) * residual.ravel())[:, None])
+    np.add.at(
+        scores, np.tile(block, 2), design * (np.tile(weight / scale, 2) * residual.ravel())[:, None]
+    )
     occupied = len(np.unique(block[weight > 0]))
     bread = np.linalg.pinv(normal, rcond=1e-14, hermitian=True)
     shared = np.diag(bread @ (scores.T @ scores) @ bread) * occupied / max(occupied - 4, 1)
@@ -174,8 +206,9 @@ def _fit(position: NDArray[np.float64], coordinates: NDArray[np.float64]) -> tup
 
 
 class Response(NamedTuple):
-    """``gamma`` of projector and camera together, and its standard ``sigma``; ``misfit_grey``: what is left, RMS grey
-    levels; ``white_grey``: the grey level of a white pattern at the board's brightest, of 255."""
+    """``gamma`` of projector and camera together, and its standard ``sigma``; ``misfit_grey``: what
+    is left, RMS grey levels; ``white_grey``: the grey level of a white pattern at the board's
+    brightest, of 255."""
 
     gamma: float
     sigma: float
@@ -184,15 +217,19 @@ class Response(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """Pattern ``levels`` from 0 to 1 and captured ``grey`` levels of n pixels in F frames, float64 (F, n) each."""
+    """Pattern ``levels`` from 0 to 1 and captured ``grey`` levels of n pixels in F frames, float64
+    (F, n) each."""
 
     levels: NDArray[np.float64]
     grey: NDArray[np.float64]
 
 
-def levels_of(frames: Sequence[NDArray], maps: Sequence[NDArray[np.float64]], pose: Pose, rig: Rig) -> Levels | None:
-    """Sinusoid levels and grey levels at bright pixels of a pose's board; ``maps``: columns and rows of the projector,
-    (H, W) px, NaN where not decoded. None where too few pixels are left, or a direction has no sinusoids."""
+def levels_of(
+    frames: Sequence[NDArray], maps: Sequence[NDArray[np.float64]], pose: Pose, rig: Rig
+) -> Levels | None:
+    """Sinusoid levels and grey levels at bright pixels of a pose's board; ``maps``: columns and
+    rows of the projector, (H, W) px, NaN where not decoded. None where too few pixels are left, or
+    a direction has no sinusoids."""
     if len(rig.fringe_directions) < len(AXES):
         return None
     x, y = pose.corners_px[np.isfinite(pose.corners_px).all(axis=1)].T
@@ -202,13 +239,17 @@ def levels_of(frames: Sequence[NDArray], maps: Sequence[NDArray[np.float64]], po
     for coordinate, direction in zip(maps, AXES, strict=True):
         part = coordinate[rows, columns]
         slopes = [np.abs(np.diff(part, axis=axis)) for axis in (0, 1)]
-        step = max(float(np.nanmedian(slope)) if np.isfinite(slope).any() else 0.0 for slope in slopes)
+        step = max(
+            float(np.nanmedian(slope)) if np.isfinite(slope).any() else 0.0 for slope in slopes
+        )
         width = max(3, int(np.ceil(AVERAGED_PERIODS * rig.pitch(direction) / max(step, 1e-3))) | 1)
         if width > min(part.shape) / 2:
             return None
         known = np.isfinite(part)
         share = uniform_filter(known.astype(np.float64), width, mode="constant")
-        mean = uniform_filter(np.where(known, part, 0.0), width, mode="constant") / np.where(share > 0, share, 1)
+        mean = uniform_filter(np.where(known, part, 0.0), width, mode="constant") / np.where(
+            share > 0, share, 1
+        )
         smooth.append(np.where(share > 1 - 1e-9, mean, np.nan))
     used = [index for index, frame in enumerate(rig.sequence) if frame.kind == "sinusoid"]
     grey = np.stack([np.asarray(frames[index])[rows, columns] for index in used]).astype(np.float64)
@@ -246,7 +287,8 @@ def fit_response(measured: Sequence[Levels]) -> Response | None:
 
 
 def _response_residuals(pose: Levels, gamma: float) -> tuple[float, NDArray[np.float64]]:
-    """Sum of squares with each pixel's own a and b, and every pixel's grey level of a white pattern, a + b."""
+    """Sum of squares with each pixel's own a and b, and every pixel's grey level of a white
+    pattern, a + b."""
     light = pose.levels**gamma
     mean_light, mean_grey = light.mean(axis=0), pose.grey.mean(axis=0)
     light, grey = light - mean_light, pose.grey - mean_grey

@@ -1,5 +1,6 @@
-"""What a calibration found: lens models, both devices, the pose between them, errors, and how sure it is of each; its
-residuals as a picture; and how far a rig's depth is from another's over the working volume."""
+"""What a calibration found: lens models, both devices, the pose between them, errors, and how sure
+it is of each; its residuals as a picture; and how far a rig's depth is from another's over the
+working volume."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -28,18 +29,25 @@ MODELS = {
     "rational": (0, 1, 2, 3, 4, 5, 6, 7),
 }
 """Free coefficients, by their place in OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6)."""
-_FIXED = {0: cv2.CALIB_FIX_K1, 1: cv2.CALIB_FIX_K2, 2: cv2.CALIB_ZERO_TANGENT_DIST, 4: cv2.CALIB_FIX_K3}
+_FIXED = {
+    0: cv2.CALIB_FIX_K1,
+    1: cv2.CALIB_FIX_K2,
+    2: cv2.CALIB_ZERO_TANGENT_DIST,
+    4: cv2.CALIB_FIX_K3,
+}
 SPOILER_SIGMAS, SPOILER_SHARE = 3.5, 1.2
-"""A pose is named when its held-out error lies above the median by this many robust sigmas and by half of the median,
-and its error in the fit is this many times the median: one that is only unlike the others predicts badly, but fits."""
+"""A pose is named when its held-out error lies above the median by this many robust sigmas and by
+half of the median, and its error in the fit is this many times the median: one that is only unlike
+the others predicts badly, but fits."""
 ACROSS, DEPTHS = 24, 9
 """Points across the image, along each side, and along the range."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens ``model`` of `MODELS`; ``square_pixels``: fx = fy; ``centred``: the principal point is the image's centre,
-    ((W - 1) / 2, (H - 1) / 2). Raises `CalibrationError` for an unknown model."""
+    """A lens ``model`` of `MODELS`; ``square_pixels``: fx = fy; ``centred``: the principal point is
+    the image's centre, ((W - 1) / 2, (H - 1) / 2). Raises `CalibrationError` for an unknown
+    model."""
 
     model: str = "radial-3+tangential"
     square_pixels: bool = False
@@ -67,7 +75,8 @@ class Lens:
 
     @property
     def free(self) -> NDArray[np.float64]:
-        """Matrix (4 + coefficients, f) from the free parameters to (fx, fy, cx, cy, coefficients)."""
+        """Matrix (4 + coefficients, f) from the free parameters to (fx, fy, cx, cy,
+        coefficients)."""
         unit = np.eye(4 + self.coefficients)
         focal = [unit[0] + unit[1]] if self.square_pixels else [unit[0], unit[1]]
         centre = [] if self.centred else [unit[2], unit[3]]
@@ -75,8 +84,8 @@ class Lens:
 
 
 class Device(NamedTuple):
-    """Camera or projector: its lens model, and the standard uncertainties ``sigma`` of fx, fy, cx, cy in px and of the
-    distortion coefficients; 0 = not estimated."""
+    """Camera or projector: its lens model, and the standard uncertainties ``sigma`` of fx, fy, cx,
+    cy in px and of the distortion coefficients; 0 = not estimated."""
 
     lens: Lens
     pinhole: Pinhole
@@ -84,8 +93,8 @@ class Device(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """OpenCV's reprojection errors in px, the root of the mean squared distance over all points: of camera, projector
-    and both."""
+    """OpenCV's reprojection errors in px, the root of the mean squared distance over all points: of
+    camera, projector and both."""
 
     camera: float
     projector: float
@@ -100,10 +109,11 @@ def errors_px(camera: NDArray[np.float64], projector: NDArray[np.float64]) -> Er
 
 @dataclass(frozen=True)
 class FittedPose:
-    """A pose of the board: rotation vector (rad) and translation (mm) to the camera's frame. Of camera and projector
-    the measured coordinates and the residuals, projected less measured, (n, 2) px each, NaN where not measured.
-    ``held_out_rms_px``: the RMS over both devices when the rig comes from the other poses and only the board's pose
-    from this one; NaN where that was not computed."""
+    """A pose of the board: rotation vector (rad) and translation (mm) to the camera's frame. Of
+    camera and projector the measured coordinates and the residuals, projected less measured, (n, 2)
+    px each, NaN where not measured. ``held_out_rms_px``: the RMS over both devices when the rig
+    comes from the other poses and only the board's pose from this one; NaN where that was not
+    computed."""
 
     name: str
     rotation_vector: tuple[float, ...]
@@ -119,15 +129,16 @@ class FittedPose:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated rig. A point goes from the camera's frame to the projector's by ``X_p = rotation X_c +
-    translation_mm``; ``rotation_sigma_rad`` is the uncertainty of a small turn about the axes of OpenCV's rotation
-    vector. ``scale`` says what the lengths were taken from. ``alone_rms_px``: the RMS of cv2.calibrateCamera for camera
-    and projector each on its own with a perfect board. ``noise_px``: standard deviations of camera and projector
-    coordinates that the residuals show, with whose inverse squares they were weighted. ``bic``: Bayesian information
-    criterion. ``board_mm``: the board's points (n, 3), estimated or given. ``doubts``: what is improbable, in sentences
-    that begin with ``warning:``, or ``note:`` where it may well be right. Uncertainties take the residuals for
-    independent: errors that all poses share, such as those of a board that is taken for perfect, make them too
-    small."""
+    """A calibrated rig. A point goes from the camera's frame to the projector's by ``X_p = rotation
+    X_c + translation_mm``; ``rotation_sigma_rad`` is the uncertainty of a small turn about the axes
+    of OpenCV's rotation vector. ``scale`` says what the lengths were taken from. ``alone_rms_px``:
+    the RMS of cv2.calibrateCamera for camera and projector each on its own with a perfect board.
+    ``noise_px``: standard deviations of camera and projector coordinates that the residuals show,
+    with whose inverse squares they were weighted. ``bic``: Bayesian information criterion.
+    ``board_mm``: the board's points (n, 3), estimated or given. ``doubts``: what is improbable, in
+    sentences that begin with ``warning:``, or ``note:`` where it may well be right. Uncertainties
+    take the residuals for independent: errors that all poses share, such as those of a board that
+    is taken for perfect, make them too small."""
 
     camera: Device
     projector: Device
@@ -160,7 +171,8 @@ class Calibration:
 
     @property
     def held_out_rms_px(self) -> float:
-        """Root mean square of the poses' held-out errors: what lens models are compared by. NaN where not computed."""
+        """Root mean square of the poses' held-out errors: what lens models are compared by. NaN
+        where not computed."""
         return float(np.sqrt(np.mean([pose.held_out_rms_px**2 for pose in self.poses])))
 
     @property
@@ -170,15 +182,17 @@ class Calibration:
         held_out = np.array([pose.held_out_rms_px for pose in self.poses])
         errors = fitted if np.isnan(held_out).any() else held_out
         middle = np.median(errors)
-        limit = middle + max(SPOILER_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(errors - middle)), 0.5 * middle)
+        limit = middle + max(
+            SPOILER_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(errors - middle)), 0.5 * middle
+        )
         bad = (errors > limit) & (fitted > SPOILER_SHARE * np.median(fitted))
         return tuple(pose.name for pose, named in zip(self.poses, bad, strict=True) if named)
 
 
 @styled
 def draw_residuals(calibration: Calibration) -> bytes:
-    """PNG of a calibration: for camera and projector the residuals by pose and the points in the image, and the RMS of
-    each pose."""
+    """PNG of a calibration: for camera and projector the residuals by pose and the points in the
+    image, and the RMS of each pose."""
     from matplotlib import colormaps
 
     poses = calibration.poses
@@ -217,7 +231,8 @@ def draw_residuals(calibration: Calibration) -> bytes:
 
 
 def _bars(axes: "Axes", calibration: Calibration) -> None:
-    """RMS of each pose in camera and projector, and held out; poses that spoil the fit are marked."""
+    """RMS of each pose in camera and projector, and held out; poses that spoil the fit are
+    marked."""
     poses, place = calibration.poses, np.arange(len(calibration.poses))
     series = {
         "camera": [pose.rms_px.camera for pose in poses],
@@ -234,8 +249,9 @@ def _bars(axes: "Axes", calibration: Calibration) -> None:
 
 
 class VolumeError(NamedTuple):
-    """Depth by one rig minus depth by the true one: ``rms_mm``, ``worst_mm``, and ``scale``, the factor between the two
-    by least squares (0.95 where a board's spacing was given 5% too small)."""
+    """Depth by one rig minus depth by the true one: ``rms_mm``, ``worst_mm``, and ``scale``, the
+    factor between the two by least squares (0.95 where a board's spacing was given 5% too
+    small)."""
 
     rms_mm: float
     worst_mm: float
@@ -243,30 +259,44 @@ class VolumeError(NamedTuple):
 
 
 def volume_error_mm(rig: Rig, true_rig: Rig) -> VolumeError:
-    """Depth error of ``rig`` where ``true_rig`` captures: a grid of points of the true working range, seen from the
-    centres of as many parts of the image, goes to image and projector px by the true rig and back to depth by the
-    other. Both are depths along the camera's axis, each of its own. Points beside the pattern don't count.
+    """Depth error of ``rig`` where ``true_rig`` captures: a grid of points of the true working
+    range, seen from the centres of as many parts of the image, goes to image and projector px by
+    the true rig and back to depth by the other. Both are depths along the camera's axis, each of
+    its own. Points beside the pattern don't count.
 
-    Raises `CalibrationError` for images or patterns of different sizes, and where no point is left or one has no depth
-    by ``rig``."""
+    Raises `CalibrationError` for images or patterns of different sizes, and where no point is left
+    or one has no depth by ``rig``."""
     for device in ("camera", "projector"):
-        sizes = [(part.width, part.height) for part in (getattr(rig, device), getattr(true_rig, device))]
+        sizes = [
+            (part.width, part.height) for part in (getattr(rig, device), getattr(true_rig, device))
+        ]
         if sizes[0] != sizes[1]:
             (w, h), (true_w, true_h) = sizes
-            raise CalibrationError(f"{device}: expected {true_w} x {true_h} px as in the true rig, got {w} x {h} px")
+            raise CalibrationError(
+                f"{device}: expected {true_w} x {true_h} px as in the true rig, got {w} x {h} px"
+            )
     camera, projector = true_rig.camera, true_rig.projector
-    sides = ((np.arange(ACROSS) + 0.5) * (length / ACROSS) - 0.5 for length in (camera.width, camera.height))
+    sides = (
+        (np.arange(ACROSS) + 0.5) * (length / ACROSS) - 0.5
+        for length in (camera.width, camera.height)
+    )
     column, row = (axis.ravel() for axis in np.meshgrid(*sides))
     x, y = camera.normalised(column, row)
     near_m, far_m = (limit / MM_PER_M for limit in true_rig.working_range_mm)
     depth_m = np.linspace(near_m, far_m, DEPTHS)[:, None]
-    u, v = true_rig.project(np.stack([x * depth_m, y * depth_m, np.broadcast_to(depth_m, (DEPTHS, x.size))], axis=-1))
+    u, v = true_rig.project(
+        np.stack([x * depth_m, y * depth_m, np.broadcast_to(depth_m, (DEPTHS, x.size))], axis=-1)
+    )
     shown = (u >= -0.5) & (u <= projector.width - 0.5) & (v >= -0.5) & (v <= projector.height - 0.5)
     if not shown.any():
-        raise CalibrationError("no point of the true rig's working range is on both image and pattern; check that rig")
+        raise CalibrationError(
+            "no point of the true rig's working range is on both image and pattern; check that rig"
+        )
     rays = rig.camera.normalised(column, row)
     if len(rig.directions) == 2:
-        weights = (1.0 / true_rig.code(direction).sigma_px(1.0, 1.0) ** 2 for direction in AXES)  # as the decoder's
+        weights = (
+            1.0 / true_rig.code(direction).sigma_px(1.0, 1.0) ** 2 for direction in AXES
+        )  # as the decoder's
         found_mm = depth_from_both(rays, u, v, rig, *weights).depth_mm
     else:
         (direction,) = rig.directions
@@ -276,7 +306,8 @@ def volume_error_mm(rig: Rig, true_rig: Rig) -> VolumeError:
     lost = int(np.isnan(found_mm).sum())
     if lost:
         raise CalibrationError(
-            f"{lost} of {len(found_mm)} points of the true rig's working range have no depth by the other rig, so the "
+            f"{lost} of {len(found_mm)} points of the true rig's working range have no depth by "
+            f"the other rig, so the "
             "two have nothing in common; check rotation, translation and the sign of the axes"
         )
     error = found_mm - true_mm

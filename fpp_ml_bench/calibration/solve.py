@@ -1,5 +1,6 @@
-"""From board poses to a calibrated rig: start by OpenCV, joint refinement, circle bias, what each pose does to it. What
-makes captures unfit for a calibration is answered with a sentence that names the pose."""
+"""From board poses to a calibrated rig: start by OpenCV, joint refinement, circle bias, what each
+pose does to it. What makes captures unfit for a calibration is answered with a sentence that names
+the pose."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,17 +25,23 @@ LEAST_TILT_RAD = np.deg2rad(5.0)
 LARGEST_FOCAL_SIGMA = 0.05
 """Relative standard uncertainty of a focal length."""
 MARGIN = 0.1
-"""By which projector coordinates may lie outside the projector, in its sizes: the fringes end there."""
+"""By which projector coordinates may lie outside the projector, in its sizes: the fringes end
+there."""
 WEIGHT_ROUNDS = 4
 CIRCLE_ROUNDS = 10
 CIRCLE_TOLERANCE_PX = 1e-7
 
 
-def check_poses(poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int], tuple[int, int]]) -> None:
-    """Raise `CalibrationError` for poses that are too few, and for all poses of another image size, with too few points
-    or too far from the projector, or in which camera and projector don't see the same side of the board."""
+def check_poses(
+    poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    """Raise `CalibrationError` for poses that are too few, and for all poses of another image size,
+    with too few points or too far from the projector, or in which camera and projector don't see
+    the same side of the board."""
     if len(poses) < FEWEST_POSES:
-        raise CalibrationError(f"expected at least {FEWEST_POSES} poses of the board, got {len(poses)}: capture more")
+        raise CalibrationError(
+            f"expected at least {FEWEST_POSES} poses of the board, got {len(poses)}: capture more"
+        )
     unfit: list[CalibrationError] = []
     for pose in poses:
         try:
@@ -45,16 +52,20 @@ def check_poses(poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int
 
 
 def raise_all(unfit: Sequence[CaptureError | CalibrationError]) -> None:
-    """Raise what makes poses unfit, if there is any: one error as it is, several as a `CalibrationError` that lists
-    them."""
+    """Raise what makes poses unfit, if there is any: one error as it is, several as a
+    `CalibrationError` that lists them."""
     if len(unfit) == 1:
         raise unfit[0]
     if unfit:
         listed = "\n  ".join(map(str, unfit))
-        raise CalibrationError(f"{len(unfit)} poses can't be used; capture them again, or remove them:\n  {listed}")
+        raise CalibrationError(
+            f"{len(unfit)} poses can't be used; capture them again, or remove them:\n  {listed}"
+        )
 
 
-def _check_pose(pose: Pose, board: Board, camera: tuple[int, int], projector: tuple[int, int]) -> None:
+def _check_pose(
+    pose: Pose, board: Board, camera: tuple[int, int], projector: tuple[int, int]
+) -> None:
     if tuple(pose.size) != camera:
         got, right = (f"{width} x {height} px" for width, height in (pose.size, camera))
         raise CalibrationError(f"pose {pose.name}: the image is {got}, the camera's are {right}")
@@ -67,21 +78,25 @@ def _check_pose(pose: Pose, board: Board, camera: tuple[int, int], projector: tu
         reason = next(iter(pose.projector.reasons.items()), None)
         why = f" (point {reason[0]}: {reason[1]})" if reason else ""
         raise CalibrationError(
-            f"pose {pose.name}: only {both.sum()} of {len(points)} points have projector coordinates, expected at "
+            f"pose {pose.name}: only {both.sum()} of {len(points)} points have projector "
+            f"coordinates, expected at "
             f"least {FEWEST_POINTS}{why}: light the whole board with the fringes"
         )
     for axis, (size, name) in enumerate(zip(projector, ("columns", "rows"), strict=True)):
         low, high = points[both, axis].min(), points[both, axis].max()
         if low < -MARGIN * size or high > (1 + MARGIN) * size:
             raise CalibrationError(
-                f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the "
-                f"projector has {size}: look at its size, the pitch, and which frames code which direction"
+                f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, "
+                f"but the "
+                f"projector has {size}: look at its size, the pitch, and which frames code which "
+                f"direction"
             )
     plane = np.column_stack([corners[both], np.ones(both.sum())])
     affine = np.linalg.lstsq(plane, points[both], rcond=None)[0][:2]
     if np.linalg.det(affine) < 0:
         raise CalibrationError(
-            f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the "
+            f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; "
+            f"mirror the "
             "images, or look at the direction in which the projector's columns and rows are counted"
         )
 
@@ -90,23 +105,31 @@ def check_start(poses: Sequence[Pose], turns: Sequence[NDArray]) -> None:
     """Raise `CalibrationError` where all boards are parallel, given their rotation vectors."""
     normals = [cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns]
     if not np.isfinite(normals).all():
-        raise CalibrationError("the poses don't determine the intrinsics: show the board from other directions")
-    tilt = max(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b)) for a, b in combinations(normals, 2))
+        raise CalibrationError(
+            "the poses don't determine the intrinsics: show the board from other directions"
+        )
+    tilt = max(
+        np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b)) for a, b in combinations(normals, 2)
+    )
     if tilt < LEAST_TILT_RAD:
         names = ", ".join(pose.name for pose in poses)
         raise CalibrationError(
-            f"poses {names}: the board is parallel in all of them, within {np.rad2deg(tilt):.1f} degrees, so that "
-            "focal length and distance can't be told apart; tilt it by 20 degrees or more, about both axes"
+            f"poses {names}: the board is parallel in all of them, within {np.rad2deg(tilt):.1f} "
+            f"degrees, so that "
+            "focal length and distance can't be told apart; tilt it by 20 degrees or more, about "
+            "both axes"
         )
 
 
 def check_solution(bundle: Bundle, x: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
-    """Raise `CalibrationError` where a focal length is not determined, given all parameters' standard uncertainties."""
+    """Raise `CalibrationError` where a focal length is not determined, given all parameters'
+    standard uncertainties."""
     for name, part in (("camera", bundle.camera), ("projector", bundle.projector)):
         focal = x[part][:2]
         if not (focal > 0).all() or (sigma[part][:2] > LARGEST_FOCAL_SIGMA * focal).any():
             raise CalibrationError(
-                f"the poses don't determine the {name}'s focal length: {focal[0]:.0f} ± {sigma[part][0]:.0f} px; tilt "
+                f"the poses don't determine the {name}'s focal length: {focal[0]:.0f} ± "
+                f"{sigma[part][0]:.0f} px; tilt "
                 "the board more and in other directions, or choose a lens with fewer terms"
             )
 
@@ -124,19 +147,23 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from at least three poses of a flat board; sizes are (width, height) in px.
 
-    ``lenses``: of camera and projector. No point is rejected. Camera and projector residuals are weighted by the
-    inverse of the variances that they show, the projector's with the own uncertainty of each point. ``estimate_board``:
-    the board's points are estimated too, about their nominal places (Strobl and Hirzinger, More accurate pinhole camera
-    calibration with imperfect planar target, ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the
-    baseline has this length; without it the scale is that of the board's spacing. ``hold_out``: compute the held-out
-    errors (a fit for each pose; needs four).
+    ``lenses``: of camera and projector. No point is rejected. Camera and projector residuals are
+    weighted by the inverse of the variances that they show, the projector's with the own
+    uncertainty of each point. ``estimate_board``: the board's points are estimated too, about their
+    nominal places (Strobl and Hirzinger, More accurate pinhole camera calibration with imperfect
+    planar target, ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the baseline
+    has this length; without it the scale is that of the board's spacing. ``hold_out``: compute the
+    held-out errors (a fit for each pose; needs four).
 
-    Raises `CalibrationError` for too few or parallel poses, other image sizes, mirrored images, points outside the
-    projector, and where the captures don't determine the rig; it names the pose."""
+    Raises `CalibrationError` for too few or parallel poses, other image sizes, mirrored images,
+    points outside the projector, and where the captures don't determine the rig; it names the
+    pose."""
     sizes = (camera_size, projector_size)
     check_poses(poses, board, sizes)
     if baseline_mm is not None and not 0 < baseline_mm < np.inf:
-        raise CalibrationError(f"baseline_mm: expected a positive number of mm, got {baseline_mm!r}")
+        raise CalibrationError(
+            f"baseline_mm: expected a positive number of mm, got {baseline_mm!r}"
+        )
     bundle, x, alone = _without_circle_bias(poses, board, sizes, lenses)
     if estimate_board:
         poses = same_labels(board, bundle, x)
@@ -149,7 +176,11 @@ def calibrate(
 
 
 def _without_circle_bias(
-    poses: Sequence[Pose], board: Board, sizes: tuple, lenses: tuple[Lens, Lens], free_board: bool = False
+    poses: Sequence[Pose],
+    board: Board,
+    sizes: tuple,
+    lenses: tuple[Lens, Lens],
+    free_board: bool = False,
 ) -> tuple[Bundle, NDArray[np.float64], tuple[float, float]]:
     """The fit, with the bias of circles' centroids taken off and fitted again until it stays."""
     start, alone = _start(poses, board, sizes, lenses)
@@ -157,7 +188,10 @@ def _without_circle_bias(
     x = _weighted_fit(bundle, start)
     for _ in range(CIRCLE_ROUNDS if board.radius_mm else 0):
         targets = [without_bias(bundle, x, index, board.radius_mm) for index in range(len(poses))]
-        change = max(np.nanmax(np.abs(new[0] - old[0])) for new, old in zip(targets, bundle.targets, strict=True))
+        change = max(
+            np.nanmax(np.abs(new[0] - old[0]))
+            for new, old in zip(targets, bundle.targets, strict=True)
+        )
         bundle.targets = targets
         x = _weighted_fit(bundle, x)
         if change < CIRCLE_TOLERANCE_PX:
@@ -168,17 +202,20 @@ def _without_circle_bias(
 def _start(
     poses: Sequence[Pose], board: Board, sizes: tuple, lenses: tuple[Lens, Lens]
 ) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """All parameters from OpenCV's calibrations of each device and of the pair, and the RMS of each device alone. First
-    with one radial term, from which the full model then starts."""
+    """All parameters from OpenCV's calibrations of each device and of the pair, and the RMS of each
+    device alone. First with one radial term, from which the full model then starts."""
     points = board.points_mm().astype(np.float32)
     intrinsics, rms, views = [], [], []
     for device, (size, lens) in enumerate(zip(sizes, lenses, strict=True)):
         seen = [[pose.corners_px, pose.projector.points_px][device] for pose in poses]
         kept = [np.isfinite(pixels).all(1) for pixels in seen]
         objects = [points[keep] for keep in kept]
-        # OpenCV refuses a start whose principal point is outside the image, where a projector's may well be: the image
-        # gets a margin of its own size all round.
-        images = [(pixels[keep] + size).astype(np.float32)[:, None] for pixels, keep in zip(seen, kept, strict=True)]
+        # OpenCV refuses a start whose principal point is outside the image, where a projector's may
+        # well be: the image gets a margin of its own size all round.
+        images = [
+            (pixels[keep] + size).astype(np.float32)[:, None]
+            for pixels, keep in zip(seen, kept, strict=True)
+        ]
         with_margin = tuple(3 * length for length in size)
         simple = Lens("radial-1" if lens.model != "none" else "none", True, lens.centred)
         try:
@@ -187,19 +224,26 @@ def _start(
             )
             if device == 0:
                 check_start(poses, turns)
-            guess = np.asarray(matrix, dtype=np.float64), np.resize(np.asarray(distortion, dtype=np.float64), 5)
+            guess = (
+                np.asarray(matrix, dtype=np.float64),
+                np.resize(np.asarray(distortion, dtype=np.float64), 5),
+            )
             flags = lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS
             error, matrix, distortion, turns, shifts = cv2.calibrateCamera(
                 objects, images, with_margin, *guess, flags=flags
             )
         except cv2.error as problem:
             raise CalibrationError(
-                f"OpenCV can't calibrate the {'projector' if device else 'camera'} from these poses ({problem.err}): "
-                "the board has to be seen from different directions, and its points labelled alike in all poses"
+                f"OpenCV can't calibrate the {'projector' if device else 'camera'} from these "
+                f"poses ({problem.err}): "
+                "the board has to be seen from different directions, and its points labelled alike "
+                "in all poses"
             ) from problem
         distortion = np.resize(np.ravel(distortion), lens.coefficients)
         if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
-            raise CalibrationError("the poses don't determine the intrinsics: show the board from other directions")
+            raise CalibrationError(
+                "the poses don't determine the intrinsics: show the board from other directions"
+            )
         intrinsics.append(np.concatenate([np.diag(matrix)[:2], matrix[:2, 2] - size, distortion]))
         rms.append(float(error))
         views.append((turns, shifts))
@@ -245,7 +289,9 @@ def _result(
 ) -> Calibration:
     sigma = np.linalg.norm(root, axis=1)
     devices = []
-    for part, lens, size in zip((bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True):
+    for part, lens, size in zip(
+        (bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True
+    ):
         fx, fy, cx, cy, *terms = x[part].tolist()
         pinhole = Pinhole(size[0], size[1], fx, fy, cx, cy, tuple(terms))
         devices.append(Device(lens, pinhole, tuple(sigma[part].tolist())))
@@ -263,7 +309,9 @@ def _result(
         place = x[bundle.pose(index)]
         turned, moved = tuple(place[:3].tolist()), tuple((factor * place[3:]).tolist())
         residuals = bundle.residuals(x, index)
-        fitted.append(FittedPose(pose.name, turned, moved, held_out[index], bundle.targets[index], residuals))
+        fitted.append(
+            FittedPose(pose.name, turned, moved, held_out[index], bundle.targets[index], residuals)
+        )
     return Calibration(
         devices[0],
         devices[1],

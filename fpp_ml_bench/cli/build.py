@@ -28,43 +28,62 @@ class BuildCommandSettings(Explain, Pool):
     """Settings of `build`, which `settings_of` makes `render.BuildSettings` of."""
 
     out: Path | RemoteFolder = option(
-        REQUIRED, "new folder, or one whose build was interrupted; or a URL: s3://bucket/set", "DIR", parse=place
+        REQUIRED,
+        "new folder, or one whose build was interrupted; or a URL: s3://bucket/set",
+        "DIR",
+        parse=place,
     )
     preset: str = option("mini", "objects and size (default: mini)", choices=tuple(PRESETS))
     size: int | None = option(
-        None, "image width and height (default: the preset's)", "PX", parse=whole(1, LARGEST_SIDE_PX, "px")
+        None,
+        "image width and height (default: the preset's)",
+        "PX",
+        parse=whole(1, LARGEST_SIDE_PX, "px"),
     )
     objects: tuple[str, ...] | None = option(
         None, "objects by name, comma separated (default: the preset's)", "A,B", parse=names
     )
-    placement: Literal["fixed", "varied"] = option("fixed", "all objects at the standoff, or a distance drawn per view")
+    placement: Literal["fixed", "varied"] = option(
+        "fixed", "all objects at the standoff, or a distance drawn per view"
+    )
     config: str | None = option(
-        None, "configuration of frames to store (default: all; with --rig crossed: crossed)", choices=CONFIGS
+        None,
+        "configuration of frames to store (default: all; with --rig crossed: crossed)",
+        choices=CONFIGS,
     )
     seed: int = option(42, "seed of noise and placement (default: 42)", "N")
     rig: str = option(
         "paper",
-        "the paper's, the same with crossed fringes (also crossed-10, crossed-18), or a rig file (default: paper)",
+        "the paper's, the same with crossed fringes (also crossed-10, crossed-18), or a rig file "
+        "(default: paper)",
         "paper|crossed|FILE",
     )
     decode_with: Path | None = option(
         None,
-        "rig that a calibration found: it decodes the ground truth and is the dataset's; --rig photographs",
+        "rig that a calibration found: it decodes the ground truth and is the dataset's; --rig "
+        "photographs",
         "FILE",
     )
     pitch: float | None = option(None, "fringe period in projector px, both directions", "PX")
     light: str = option(
-        "paper", "paper, workshop, hard, or a YAML file with other numbers (default: paper)", "NAME|FILE"
+        "paper",
+        "paper, workshop, hard, or a YAML file with other numbers (default: paper)",
+        "NAME|FILE",
     )
     noise_sigma: float | None = option(
         None,
-        "sensor noise at mid-grey, grey levels of 255, half of its variance shot noise (default: the light's)",
+        "sensor noise at mid-grey, grey levels of 255, half of its variance shot noise (default: "
+        "the light's)",
         "GREY",
         parse=value("0 to 50 grey levels", float, lambda grey: 0 <= grey <= 50),
     )
     shadows: bool = option(False, "let objects cast shadows, whatever the light says")
     mesh: tuple[Path, ...] = option(
-        (), "a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable", "FILE", parse=Path, many=True
+        (),
+        "a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable",
+        "FILE",
+        parse=Path,
+        many=True,
     )
     meshes: Path | None = option(None, "meshes of yours with scale, pose and split", "LIST.yaml")
 
@@ -82,10 +101,17 @@ def settings_of(given: BuildCommandSettings) -> "BuildSettings":
         if given.pitch >= 4:  # below that the rig itself refuses, with its own words
             lengths = (rig.pattern_length(direction) for direction in DIRECTIONS)
             horizontal, vertical = (bits_needed(length, given.pitch) for length in lengths)
-            horizontal, vertical = max(sequence.bits_horizontal, horizontal), max(sequence.bits_vertical, vertical)
+            horizontal, vertical = (
+                max(sequence.bits_horizontal, horizontal),
+                max(sequence.bits_vertical, vertical),
+            )
             sequence = replace(sequence, bits_horizontal=horizontal, bits_vertical=vertical)
-        rig = replace(rig, pitch_horizontal_px=given.pitch, pitch_vertical_px=given.pitch, sequence=sequence)
-    own = (read_mesh_list(given.meshes) if given.meshes else ()) + tuple(map(single_mesh, given.mesh))
+        rig = replace(
+            rig, pitch_horizontal_px=given.pitch, pitch_vertical_px=given.pitch, sequence=sequence
+        )
+    own = (read_mesh_list(given.meshes) if given.meshes else ()) + tuple(
+        map(single_mesh, given.mesh)
+    )
     if given.objects is not None:
         objects = given.objects
     elif own:
@@ -118,7 +144,8 @@ fpp-bench build --out data/pen --objects pen --explain             what was left
 """
 )
 def build(settings: BuildCommandSettings) -> None:
-    """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."""
+    """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground
+    truth."""
     build_settings, workers = settings_of(settings), settings.processes
     assembly = assembly_of(build_settings)
     rows = sum(len(plan.samples) for plan in assembly.plans)
@@ -135,7 +162,11 @@ def build(settings: BuildCommandSettings) -> None:
     seconds = perf_counter() - started
     # The first step is what an interrupted run had left: it took no time now.
     made = sum(steps[1:]) * frames
-    rate = f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)" if made else "complete already"
+    rate = (
+        f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)"
+        if made
+        else "complete already"
+    )
     print(f"{out}: {contents(manifest)}; {rate}")
     for line in ground_truth_summary(manifest):
         print(f"  {line}")

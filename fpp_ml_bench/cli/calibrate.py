@@ -20,7 +20,12 @@ from fpp_ml_bench.loaders.captures.decoding import board_poses as read_board_pos
 from fpp_ml_bench.loaders.captures.decoding import calibrated_rig, pose_folders
 from fpp_ml_bench.loaders.published.importing import plan_import, tree_views
 from fpp_ml_bench.loaders.render.boards.captures import photograph_board
-from fpp_ml_bench.loaders.render.boards.poses import BOARD_POSES, PAPER_BOARD, board_poses, fitting_board
+from fpp_ml_bench.loaders.render.boards.poses import (
+    BOARD_POSES,
+    PAPER_BOARD,
+    board_poses,
+    fitting_board,
+)
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, write_opencv_calibration
@@ -47,7 +52,9 @@ def _pitches(text: str) -> tuple[float, float]:
 
 
 PITCHES = value(
-    "a pitch of at least 4 px, or VERTICAL,HORIZONTAL", _pitches, lambda px: all(4 <= pitch < 65536 for pitch in px)
+    "a pitch of at least 4 px, or VERTICAL,HORIZONTAL",
+    _pitches,
+    lambda px: all(4 <= pitch < 65536 for pitch in px),
 )
 PROJECTOR = value("width x height in px such as 912x1140", _size, lambda size: min(size) > 1)
 FOCAL = value("a focal length in px", float, lambda px: 0 < px < 1e6)
@@ -59,11 +66,15 @@ class BoardSettings:
 
     HEADING = "board"
     board: str | None = option(None, "the board, such as checker:9x13:10", "KIND:CxR:MM")
-    sequence: Path | None = option(None, "rig file with the projector's size and the sequence", "FILE")
+    sequence: Path | None = option(
+        None, "rig file with the projector's size and the sequence", "FILE"
+    )
     lens: str = option(
         AUTO,
-        "none, radial-1, radial-2, radial-3+tangential, rational, or two of them, CAMERA,PROJECTOR; auto (default): "
-        f"the model of {', '.join(AUTO_MODELS)} with the least error at poses that are left out of the fit",
+        "none, radial-1, radial-2, radial-3+tangential, rational, or two of them, "
+        "CAMERA,PROJECTOR; auto (default): "
+        f"the model of {', '.join(AUTO_MODELS)} with the least error at poses that are left out of "
+        f"the fit",
         "MODEL",
     )
     square_pixels: bool = option(False, "fx = fy, of both devices")
@@ -78,7 +89,9 @@ class BoardSettings:
     bits: int | None = option(None, "bits of the camera, where files of 16 bits hold fewer", "N")
     colour: str | None = option(None, "of colour images: luminance, mean, red, green, blue", "NAME")
     anyway: bool = option(False, "use poses whose frames the examination refuses, too")
-    opencv: Path | None = option(None, "also write OpenCV's calibration file (.xml, .yml, .json)", "FILE")
+    opencv: Path | None = option(
+        None, "also write OpenCV's calibration file (.xml, .yml, .json)", "FILE"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +101,10 @@ class VirtualSettings:
     HEADING = "virtual"
     true_rig: Path | None = option(None, "the rig that photographs (default: the paper's)", "FILE")
     size: int | None = option(
-        None, "width of its images (default: the rig's)", "PX", parse=whole(64, LARGEST_SIDE_PX, "px")
+        None,
+        "width of its images (default: the rig's)",
+        "PX",
+        parse=whole(64, LARGEST_SIDE_PX, "px"),
     )
     poses: int | None = option(None, "poses of the board (default: 18)", "N", parse=whole(1, 100))
 
@@ -112,17 +128,25 @@ class DepthSettings:
     frame_order: str = option(
         "auto", "order of the raw scans' files (default: auto, determined from the images)", "NAME"
     )
-    workers: int | None = option(None, "threads (default: one per processor)", "N", parse=AT_LEAST_ONE)
+    workers: int | None = option(
+        None, "threads (default: one per processor)", "N", parse=AT_LEAST_ONE
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings(DepthSettings, VirtualSettings, BoardSettings):
     """Settings of `calibrate`."""
 
-    captures: Path | None = argument("folder with a folder of frames for each board pose", "CAPTURES", None)
-    from_depth: Path | None = option(None, "instead: a published tree with raw scans and depth in mm", "TREE")
+    captures: Path | None = argument(
+        "folder with a folder of frames for each board pose", "CAPTURES", None
+    )
+    from_depth: Path | None = option(
+        None, "instead: a published tree with raw scans and depth in mm", "TREE"
+    )
     virtual: Path | None = option(
-        None, "instead: photograph a board with a virtual rig into DIR, and calibrate from the images", "DIR"
+        None,
+        "instead: photograph a board with a virtual rig into DIR, and calibrate from the images",
+        "DIR",
     )
     out: Path = option(REQUIRED, "rig file to write, .yaml or .json", "RIG")
 
@@ -147,29 +171,43 @@ rig found decodes from the frames with the tree's depth.
 """
 )
 def calibrate(settings: CalibrateSettings) -> None:
-    """Find the rig that took captures: camera, projector and pose, from poses of a board or from frames with depth.
+    """Find the rig that took captures: camera, projector and pose, from poses of a board or from
+    frames with depth.
 
     Raises FppBenchError for unusable captures, rigs or files."""
     out = settings.out
     is_json(out)
     if not out.absolute().parent.is_dir():
         raise RigError(f"{out}: the folder {out.parent} does not exist; make it first")
-    if sum(given is not None for given in (settings.captures, settings.from_depth, settings.virtual)) != 1:
-        raise CalibrationError("expected one of CAPTURES of a board, --from-depth TREE, or --virtual DIR")
+    if (
+        sum(
+            given is not None
+            for given in (settings.captures, settings.from_depth, settings.virtual)
+        )
+        != 1
+    ):
+        raise CalibrationError(
+            "expected one of CAPTURES of a board, --from-depth TREE, or --virtual DIR"
+        )
     if settings.pitch is not None and settings.focal is not None:
-        raise CalibrationError("--pitch and --focal: each gives the size of the projector's pixels; give one of them")
+        raise CalibrationError(
+            "--pitch and --focal: each gives the size of the projector's pixels; give one of them"
+        )
     if settings.from_depth is not None:
         _from_depth(settings, settings.from_depth)
     elif settings.virtual is not None:
         _virtual(settings, settings.virtual)
     elif settings.captures is not None:
         if settings.board is None or settings.sequence is None:
-            raise CalibrationError("captures of a board need --board KIND:COLUMNSxROWS:SPACING and --sequence FILE")
+            raise CalibrationError(
+                "captures of a board need --board KIND:COLUMNSxROWS:SPACING and --sequence FILE"
+            )
         _from_board(settings, settings.captures, parse_board(settings.board), settings.sequence)
 
 
 def _virtual(settings: CalibrateSettings, folder: Path) -> None:
-    """Photograph a board, calibrate from the images alone, and compare with the rig that took them."""
+    """Photograph a board, calibrate from the images alone, and compare with the rig that took
+    them."""
     true_rig = paper_rig() if settings.true_rig is None else load_rig(settings.true_rig)
     true_rig = true_rig if settings.size is None else true_rig.scaled(settings.size)
     if settings.board is not None:
@@ -184,7 +222,8 @@ def _virtual(settings: CalibrateSettings, folder: Path) -> None:
     found = _from_board(settings, folder, board, folder / "rig.yaml", true_rig)
     error = volume_error_mm(found, true_rig)
     print(
-        f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most, "
+        f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, "
+        f"{error.worst_mm:.3f} mm at most, "
         f"scale {error.scale:.5f}; baseline {MM_PER_M * true_rig.baseline_m:.2f} mm"
     )
 
@@ -195,7 +234,12 @@ def _from_depth(settings: CalibrateSettings, tree: Path) -> None:
     with progress_bar("reading", len(reader.samples), "views") as advance:
         views = tree_views(reader, settings.workers or usable_cores(), advance)
     rig, fit = fit_projector(
-        views, reader.rig, settings.projector, pitch_px=settings.pitch, focal_px=settings.focal, lens=settings.lens_term
+        views,
+        reader.rig,
+        settings.projector,
+        pitch_px=settings.pitch,
+        focal_px=settings.focal,
+        lens=settings.lens_term,
     )
     print_fit(rig, fit)
     save_rig(rig, settings.out)
@@ -209,18 +253,31 @@ def _from_board(
     sequence: Path,
     like: "Rig | None" = None,
 ) -> "Rig":
-    """Calibrate, print and write; the rig, with standoff, background and (if none is given) range of ``like``."""
+    """Calibrate, print and write; the rig, with standoff, background and (if none is given) range
+    of ``like``."""
     lenses = _lenses(settings)
     examined: dict[str, Examination] = {}
     with progress_bar("finding the board", len(pose_folders(folder)), "poses") as advance:
         poses, rig, response = read_board_poses(
-            folder, board, sequence, settings.bits, settings.colour, advance, settings.anyway, examined.__setitem__
+            folder,
+            board,
+            sequence,
+            settings.bits,
+            settings.colour,
+            advance,
+            settings.anyway,
+            examined.__setitem__,
         )
     for name, examination in examined.items():
-        say_findings(examination, f"{name}: ", notes=False)  # the response is measured over all poses
+        say_findings(
+            examination, f"{name}: ", notes=False
+        )  # the response is measured over all poses
     lenses = lenses if len(poses) > 3 else lenses[:1]  # models are compared by poses left out
     sizes = (poses[0].size, (rig.projector.width, rig.projector.height))
-    options: dict[str, Any] = {"estimate_board": settings.estimate_board, "baseline_mm": settings.baseline}
+    options: dict[str, Any] = {
+        "estimate_board": settings.estimate_board,
+        "baseline_mm": settings.baseline,
+    }
     with progress_bar("fitting", len(lenses), "lens models") as advance:
         found = []
         for lens in lenses:
@@ -230,28 +287,39 @@ def _from_board(
         compared = Table("lens model", numbers=("RMS, px", "left out, px", "BIC"))
         for one in found:
             compared.add_row(
-                str(one.camera.lens), f"{one.rms_px.both:.4f}", f"{one.held_out_rms_px:.4f}", f"{one.bic:.0f}"
+                str(one.camera.lens),
+                f"{one.rms_px.both:.4f}",
+                f"{one.held_out_rms_px:.4f}",
+                f"{one.bic:.0f}",
             )
         show(compared)
     best = min(found, key=lambda one: one.held_out_rms_px)
-    rig = calibrated_rig(best, rig, settings.working_range or (like.working_range_mm if like else None))
+    rig = calibrated_rig(
+        best, rig, settings.working_range or (like.working_range_mm if like else None)
+    )
     if like is not None:
         rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
     check_lengths(rig, "the spacing of --board, in mm,")
     print_calibration(best)
     if response is not None:
         print(
-            f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and camera together; "
+            f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and "
+            f"camera together; "
             f"white on the board: {response.white_grey:.0f} of 255 grey levels"
         )
     save_rig(rig, settings.out)
     written = [settings.out, settings.out.with_suffix(".png")]
     write_atomically(written[-1], draw_residuals(best))
     if settings.opencv is not None:
-        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, best.rms_px)
+        content = OpenCvCalibration(
+            rig.camera, rig.projector, rig.rotation, rig.translation_m, best.rms_px
+        )
         write_opencv_calibration(content, settings.opencv)
         written.append(settings.opencv)
-    print(f"wrote {', '.join(map(str, written))}; next: fpp-bench decode {settings.out} FRAMES --out OUT")
+    print(
+        f"wrote {', '.join(map(str, written))}; next: fpp-bench decode {settings.out} FRAMES --out "
+        f"OUT"
+    )
     return rig
 
 
@@ -282,17 +350,30 @@ def print_calibration(found: "Calibration") -> None:
     for doubt in found.doubts:
         print(doubt, file=sys.stderr)
     if isnan(found.held_out_rms_px):
-        few = f"{len(found.poses)} poses: none can be left out to compare lens models or to find a bad pose"
-        print(f"note: {few}; the lens is {found.camera.lens}. Capture four or more", file=sys.stderr)
+        few = (
+            f"{len(found.poses)} poses: none can be left out to compare lens models or to find a "
+            f"bad pose"
+        )
+        print(
+            f"note: {few}; the lens is {found.camera.lens}. Capture four or more", file=sys.stderr
+        )
     if found.spoilers:
-        print(f"  (!) {', '.join(found.spoilers)}: fits the other poses badly; look at it, or capture it again")
+        print(
+            f"  (!) {', '.join(found.spoilers)}: fits the other poses badly; look at it, or "
+            f"capture it again"
+        )
     alone = ", ".join(
-        f"{name} {error:.4f}" for name, error in zip(("camera", "projector"), found.alone_rms_px, strict=True)
+        f"{name} {error:.4f}"
+        for name, error in zip(("camera", "projector"), found.alone_rms_px, strict=True)
     )
-    print(f"alone           {alone} px (each device by OpenCV's calibrateCamera, with a perfect board)")
+    print(
+        f"alone           {alone} px (each device by OpenCV's calibrateCamera, with a perfect "
+        f"board)"
+    )
     for name, device in (("camera", found.camera), ("projector", found.projector)):
         values = [
-            f"{label} {getattr(device.pinhole, label):.2f} " + (f"+- {sigma:.2f}" if sigma else "(fixed)")
+            f"{label} {getattr(device.pinhole, label):.2f} "
+            + (f"+- {sigma:.2f}" if sigma else "(fixed)")
             for label, sigma in zip(("fx", "fy", "cx", "cy"), device.sigma, strict=False)
         ]
         terms = ", ".join(f"{term:.5f}" for term in device.pinhole.distortion)
@@ -301,28 +382,51 @@ def print_calibration(found: "Calibration") -> None:
         f"{length:.2f} +- {sigma:.2f}"
         for length, sigma in zip(found.translation_mm, found.translation_sigma_mm, strict=True)
     )
-    print(f"translation     {x}, {y}, {z} mm; baseline {found.baseline_mm:.2f} mm; scale {found.scale}")
+    print(
+        f"translation     {x}, {y}, {z} mm; baseline {found.baseline_mm:.2f} mm; scale "
+        f"{found.scale}"
+    )
 
 
 def print_fit(rig: "Rig", fit: "DepthFit") -> None:
-    """Print a fitted rig and its residuals: of all views together, and of the views with the largest RMS."""
+    """Print a fitted rig and its residuals: of all views together, and of the views with the
+    largest RMS."""
     columns = "pixels", "no depth", "median", "sigma", "RMS", "RMS, px"
-    shown = sorted(fit.views, key=lambda view: -view.rms_mm if view.pixels else float("-inf"))[:_MOST_SHOWN]
-    more = f", the worst {len(shown)} of {len(fit.views)} views" if len(shown) < len(fit.views) else ""
+    shown = sorted(fit.views, key=lambda view: -view.rms_mm if view.pixels else float("-inf"))[
+        :_MOST_SHOWN
+    ]
+    more = (
+        f", the worst {len(shown)} of {len(fit.views)} views" if len(shown) < len(fit.views) else ""
+    )
     table = Table("", numbers=columns, title=f"depth by the rig minus the depth given, mm{more}")
     for view in (*shown, fit.total):
-        lengths = (f"{view.median_mm:.4f}", f"{view.sigma_mm:.4f}", f"{view.rms_mm:.4f}", f"{view.rms_px:.3f}")
+        lengths = (
+            f"{view.median_mm:.4f}",
+            f"{view.sigma_mm:.4f}",
+            f"{view.rms_mm:.4f}",
+            f"{view.rms_px:.3f}",
+        )
         cells = lengths if view.pixels else "----"
-        table.add_row(view.name, str(view.pixels), str(view.missing), *cells, end_section=view is shown[-1])
+        table.add_row(
+            view.name, str(view.pixels), str(view.missing), *cells, end_section=view is shown[-1]
+        )
     projector, (x, y, z) = rig.projector, (MM_PER_M * shift for shift in rig.translation_m)
-    measured = " and ".join(f"{p:.3f} +- {e:.3f}" for p, e in zip(fit.pitch_px, fit.pitch_error_px, strict=True))
+    measured = " and ".join(
+        f"{p:.3f} +- {e:.3f}" for p, e in zip(fit.pitch_px, fit.pitch_error_px, strict=True)
+    )
     show(table)
-    print(f"pitch           {rig.pitch_vertical_px:g} px vertical, {rig.pitch_horizontal_px:g} px horizontal fringes")
+    print(
+        f"pitch           {rig.pitch_vertical_px:g} px vertical, {rig.pitch_horizontal_px:g} px "
+        f"horizontal fringes"
+    )
     print(f"  taken from    {fit.pitch_from}; measured {measured}")
     print(
-        f"projector       {projector.width} x {projector.height} px, focal length {projector.fx:.2f} and "
+        f"projector       {projector.width} x {projector.height} px, focal length "
+        f"{projector.fx:.2f} and "
         f"{projector.fy:.2f} px, principal point {projector.cx:.2f}, {projector.cy:.2f}"
     )
     if projector.is_distorted:
         print(f"  lens          k1 {projector.distortion[0]:.5f}")
-    print(f"translation     {x:.2f}, {y:.2f}, {z:.2f} mm; baseline {MM_PER_M * rig.baseline_m:.2f} mm")
+    print(
+        f"translation     {x:.2f}, {y:.2f}, {z:.2f} mm; baseline {MM_PER_M * rig.baseline_m:.2f} mm"
+    )

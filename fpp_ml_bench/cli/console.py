@@ -1,4 +1,5 @@
-"""Console output: a progress bar on standard error, numbers with units for tables, and accounts of skipped work."""
+"""Console output: a progress bar on standard error, numbers with units for tables, and accounts of
+skipped work."""
 
 import os
 import sys
@@ -23,9 +24,11 @@ WIDTH_IN_PIPES = 140
 
 
 @contextmanager
-def progress_bar(title: str, total: int, unit: str, shown: bool = True) -> Iterator[Callable[[int], None]]:
-    """Progress over ``total`` steps, each a ``unit``, as `bars`; yields the function that advances it. Unless
-    ``shown``, it appears with the first step: before, the work may be refused."""
+def progress_bar(
+    title: str, total: int, unit: str, shown: bool = True
+) -> Iterator[Callable[[int], None]]:
+    """Progress over ``total`` steps, each a ``unit``, as `bars`; yields the function that advances
+    it. Unless ``shown``, it appears with the first step: before, the work may be refused."""
     from rich.progress import MofNCompleteColumn
 
     with bars(MofNCompleteColumn(), words(unit)) as progress:
@@ -54,7 +57,10 @@ def contents(manifest: "Manifest") -> str:
     """What a dataset holds, as text: samples of each split, images and bytes."""
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
     images = len(manifest.stored_frames) * sum(map(len, manifest.samples.values()))
-    return f"{parts} samples, {images:,} images, {gigabytes(sum(file.bytes for file in manifest.files))}"
+    return (
+        f"{parts} samples, {images:,} images, "
+        f"{gigabytes(sum(file.bytes for file in manifest.files))}"
+    )
 
 
 def millimetres(value: float | None) -> str:
@@ -63,9 +69,13 @@ def millimetres(value: float | None) -> str:
 
 
 def say_benchmark(manifest: "Manifest") -> None:
-    """Print which benchmark a dataset is; a warning on standard error where it should be one and is not."""
+    """Print which benchmark a dataset is; a warning on standard error where it should be one and is
+    not."""
     as_expected, sentence = benchmark_sentence(manifest)
-    print(f"benchmark: {sentence}" if as_expected else f"warning: {sentence}", file=None if as_expected else sys.stderr)
+    print(
+        f"benchmark: {sentence}" if as_expected else f"warning: {sentence}",
+        file=None if as_expected else sys.stderr,
+    )
 
 
 def say_findings(examination: Examination, where: str = "", notes: bool = True) -> None:
@@ -77,9 +87,10 @@ def say_findings(examination: Examination, where: str = "", notes: bool = True) 
 
 
 def show(*parts: RenderableType) -> None:
-    """Print to stdout: plain text of a fixed width into pipes and files, of the width that COLUMNS says, and colours
-    only on a terminal."""
-    # A name may hold characters that the terminal's encoding lacks; a table with a mark in it beats a traceback.
+    """Print to stdout: plain text of a fixed width into pipes and files, of the width that COLUMNS
+    says, and colours only on a terminal."""
+    # A name may hold characters that the terminal's encoding lacks; a table with a mark in it beats
+    # a traceback.
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="replace")
     width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDTH_IN_PIPES
@@ -90,7 +101,11 @@ def show(*parts: RenderableType) -> None:
 
 def explanation_table(explanation: Explanation) -> Table:
     """What was left out."""
-    state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
+    state = (
+        "left out"
+        if explanation.skipping
+        else "nothing left out (skipping is off); it would have been"
+    )
     table = Table(
         "what",
         "unit",

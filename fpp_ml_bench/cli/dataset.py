@@ -42,10 +42,14 @@ def info(
     *,
     dataset: Path = argument("dataset folder", "DATASET"),
     json: Path | None = option(
-        None, "write all of it as JSON; - is standard output, without the table", "FILE", parse=new_file
+        None,
+        "write all of it as JSON; - is standard output, without the table",
+        "FILE",
+        parse=new_file,
     ),
 ) -> None:
-    """Print what a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
+    """Print what a dataset holds: sizes, configurations, splits, rig, and how exact its ground
+    truth is."""
     opened = DatasetFolder(dataset)
     benchmark = benchmark_of(opened.content)
     manifest, rig = opened.manifest, opened.rig
@@ -54,7 +58,9 @@ def info(
         content = {
             "path": str(opened.path),
             "fingerprint": opened.fingerprint,
-            "benchmark": None if benchmark is None else {"name": benchmark.name, "version": benchmark.version},
+            "benchmark": None
+            if benchmark is None
+            else {"name": benchmark.name, "version": benchmark.version},
             "origin": manifest.origin,
             "size": list(opened.size),
             "configs": list(opened.configs),
@@ -78,22 +84,34 @@ def info(
     generator = manifest.generator
     height, width = opened.size
     print(f"dataset         {opened.path}")
-    print(f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}")
+    print(
+        f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}"
+    )
     print(f"fingerprint     {opened.fingerprint}")
     print(f"benchmark       by its manifest: {benchmark_sentence(manifest)[1]}")
     print("                (fpp-bench verify reads the images)")
-    print(f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: {manifest.stored}")
+    print(
+        f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: "
+        f"{manifest.stored}"
+    )
     print(f"configurations  {', '.join(opened.configs)}")
-    print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
+    print(
+        f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}"
+    )
     print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
     if error is not None:
         lengths = f"{error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most"
-        print(f"calibration     decoded with this rig, photographed by another; depths differ by {lengths}")
+        print(
+            f"calibration     decoded with this rig, photographed by another; depths differ by "
+            f"{lengths}"
+        )
     for line in _fringe_lines(rig):
         print(line)
     print(f"settings        {', '.join(f'{key} {value}' for key, value in built_with.items())}")
     title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
-    table = Table("", numbers=[split["split"] for split in statistics], title=title, elsewhere="--json FILE")
+    table = Table(
+        "", numbers=[split["split"] for split in statistics], title=title, elsewhere="--json FILE"
+    )
     for row_title, cell in _ROWS:
         table.add_row(row_title, *map(cell, statistics))
     show(table)
@@ -108,7 +126,8 @@ def _calibration_error(manifest: "Manifest") -> "VolumeError | None":
 
 
 def _fringe_lines(rig: "Rig") -> list[str]:
-    """How the rig codes, and how the camera samples the fringes: the vertical ones where there are both."""
+    """How the rig codes, and how the camera samples the fringes: the vertical ones where there are
+    both."""
     ways = rig.fringe_directions
     if isinstance(rig.sequence, Sequence):
         coded = f"pitch {rig.pitch('horizontal'):g} / {rig.pitch('vertical'):g} px"
@@ -152,21 +171,33 @@ def show_sample(
     *,
     dataset: Path = argument("dataset folder", "DATASET"),
     sample: str | None = argument("sample such as power_drill_A60", "SAMPLE", None),
-    cloud: bool = option(False, "also write the points: SAMPLE.ply, and SAMPLE.html to turn in a browser"),
+    cloud: bool = option(
+        False, "also write the points: SAMPLE.ply, and SAMPLE.html to turn in a browser"
+    ),
     predictions: Path | None = option(
         None, "show the prediction in this folder, its error and its points instead", "DIR"
     ),
     sheet: bool = option(False, "all objects and views on one sheet instead"),
     split: str = option("all", "split that --sheet shows (default: all)", "SPLIT"),
-    views: int = option(len(VIEWS), "views of each object that --sheet shows, from the first (default: all)", "N"),
-    out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"),
+    views: int = option(
+        len(VIEWS), "views of each object that --sheet shows, from the first (default: all)", "N"
+    ),
+    out: Path | None = option(
+        None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"
+    ),
 ) -> None:
-    """Draw one sample (frames, depth, error, mask, mesh), a prediction of it, or a contact sheet of all objects."""
+    """Draw one sample (frames, depth, error, mask, mesh), a prediction of it, or a contact sheet of
+    all objects."""
     if sheet == (sample is not None):
-        raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the samples")
+        raise DatasetError(
+            "expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the "
+            "samples"
+        )
     for flag, value in (("--cloud", cloud), ("--predictions", predictions)):
         if sheet and value:
-            raise DatasetError(f"{flag}: expected a SAMPLE, which it shows, not --sheet; leave one of them out")
+            raise DatasetError(
+                f"{flag}: expected a SAMPLE, which it shows, not --sheet; leave one of them out"
+            )
     picture = out or Path("sheet.png" if sheet else f"{sample}.png")
     if picture.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
@@ -183,9 +214,11 @@ def show_sample(
     print(*written, sep="\n")
 
 
-def _prediction_picture(opened: DatasetFolder, sample: str, folder: Path, picture: Path, cloud: bool) -> list[Path]:
-    """Draw the prediction of ``sample`` in ``folder`` to ``picture``, with ``cloud`` its points too; the files. Raises
-    PredictionError for predictions that could not be scored."""
+def _prediction_picture(
+    opened: DatasetFolder, sample: str, folder: Path, picture: Path, cloud: bool
+) -> list[Path]:
+    """Draw the prediction of ``sample`` in ``folder`` to ``picture``, with ``cloud`` its points
+    too; the files. Raises PredictionError for predictions that could not be scored."""
     split = opened.split_of_sample(sample)
     target = DEPTH_EXACT if opened.has_exact else DEPTH
     submission, depth_mm = predicted_mm(folder, opened, split, sample, target)
@@ -207,7 +240,8 @@ def verify(
     *,
     dataset: Path = argument("dataset folder", "DATASET"),
 ) -> int | None:
-    """Check that a dataset is intact: checksums, files, labels, split leaks, duplicated images; name its benchmark."""
+    """Check that a dataset is intact: checksums, files, labels, split leaks, duplicated images;
+    name its benchmark."""
     manifest = read_manifest(dataset)
     files = manifest.files
     with progress_bar("verifying", len(files), "files") as advance:
@@ -219,7 +253,10 @@ def verify(
     if findings:
         print(f"{dataset}: {len(findings)} finding(s) in {len(files)} files, {size}")
         return CHECK_FAILED
-    print(f"{dataset}: intact; {len(files)} files, {size}, {samples} samples, no object or image in two splits")
+    print(
+        f"{dataset}: intact; {len(files)} files, {size}, {samples} samples, no object or image in "
+        f"two splits"
+    )
     print(f"fingerprint {manifest.fingerprint}")
     say_benchmark(manifest)
     return None
@@ -247,7 +284,9 @@ def export(
     wanted = {"parquet": parquet, "mat": mat, "meshes": meshes, "patterns": patterns}
     forms = [form for form in FORMS if wanted[form]]
     if not forms:
-        raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
+        raise BuildError(
+            "nothing to export: give at least one of --parquet, --mat, --meshes, --patterns"
+        )
     opened = DatasetFolder(dataset)
     splits = chosen_splits(opened, split)
     samples = sum(len(opened.samples(part)) for part in splits)
@@ -258,6 +297,10 @@ def export(
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")
     if "mat" in forms:
-        scans = "with raw scans" if "all" in opened.configs else "without raw scans: not all frames are stored"
+        scans = (
+            "with raw scans"
+            if "all" in opened.configs
+            else "without raw scans: not all frames are stored"
+        )
         exact = "; depth_exact has no place in the published layout" if opened.has_exact else ""
         print(f"  published layout {scans}{exact}")

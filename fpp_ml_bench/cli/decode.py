@@ -14,7 +14,13 @@ from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.examination.findings import RefusedCapture
 from fpp_ml_bench.files import LOCK_FILE, exclusive, visible
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture, decode_capture, read_mask
-from fpp_ml_bench.loaders.captures.exports import FORMS, check_outputs, clear_outputs, write_capture, write_report
+from fpp_ml_bench.loaders.captures.exports import (
+    FORMS,
+    check_outputs,
+    clear_outputs,
+    write_capture,
+    write_report,
+)
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig_file import check_lengths, load_rig
@@ -37,7 +43,9 @@ def decode(
     file: Path = argument("rig file (.yaml, .json)", "RIG"),
     frames: str = argument("folder of images, or a pattern in quotes, 'scan/*/*.png'", "FRAMES"),
     out: Path = option(REQUIRED, "folder for the results", "DIR"),
-    direction: Directions = option("both", "which of the coded directions to use (default: all there are)"),
+    direction: Directions = option(
+        "both", "which of the coded directions to use (default: all there are)"
+    ),
     working_range: tuple[float, float] | None = option(
         None, "working range in mm (default: the rig's)", "NEAR,FAR", parse=WORKING_RANGE
     ),
@@ -47,22 +55,33 @@ def decode(
     ),
     noise: float | None = option(
         None,
-        "noise of a frame in grey levels of 255 (default: measured with four steps and more, else 1)",
+        "noise of a frame in grey levels of 255 (default: measured with four steps and more, else "
+        "1)",
         "GREY",
     ),
-    bits: int | None = option(None, "bits of the camera, 8 to 16, where files of 16 bits hold fewer", "N"),
-    colour: str | None = option(None, "of colour images: luminance, mean, red, green, blue", "NAME"),
+    bits: int | None = option(
+        None, "bits of the camera, 8 to 16, where files of 16 bits hold fewer", "N"
+    ),
+    colour: str | None = option(
+        None, "of colour images: luminance, mean, red, green, blue", "NAME"
+    ),
     forms: tuple[str, ...] = option(
         FORMS,
-        "what to write of npy, mat, png, ply, mesh (default: all); points and meshes are in mm, camera axes: x right, "
+        "what to write of npy, mat, png, ply, mesh (default: all); points and meshes are in mm, "
+        "camera axes: x right, "
         "y down, z forward",
         "A,B",
-        parse=value(f"some of {', '.join(FORMS)}", names, lambda some: some != () and set(some) <= {*FORMS}),
+        parse=value(
+            f"some of {', '.join(FORMS)}", names, lambda some: some != () and set(some) <= {*FORMS}
+        ),
     ),
     anyway: bool = option(False, "decode a capture that its examination refuses"),
-    threads: int = option(usable_cores(), "threads (default: one for each core)", "N", parse=AT_LEAST_ONE),
+    threads: int = option(
+        usable_cores(), "threads (default: one for each core)", "N", parse=AT_LEAST_ONE
+    ),
 ) -> None:
-    """Decode captured frames: depth, point cloud, uncertainty, and the reason for every pixel without depth.
+    """Decode captured frames: depth, point cloud, uncertainty, and the reason for every pixel
+    without depth.
 
     Raises FppBenchError for an unusable rig, capture or folder."""
     check_outputs(out)
@@ -114,7 +133,10 @@ def _print(result: "DecodedCapture") -> None:
     found = decoded.depth_mm > 0
     depths, sigmas = decoded.depth_mm[found].astype(np.float64), result.sigma_mm[found]
     source = "measured" if result.noise_measured else "given or assumed"
-    print(f"depth           {depths.min():.1f} to {depths.max():.1f} mm, median {np.median(depths):.1f} mm")
+    print(
+        f"depth           {depths.min():.1f} to {depths.max():.1f} mm, median "
+        f"{np.median(depths):.1f} mm"
+    )
     noise = f"noise of {result.noise_grey:.2f} grey levels, {source}"
     if result.examination.not_checked:
         print(f"not checked     {'; '.join(result.examination.not_checked)}")

@@ -1,5 +1,6 @@
-"""What a model reads and what breaks it: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it
-follows the fringe's phase, ``fpp-bench robustness`` how its error grows when the scene is disturbed, axis by axis."""
+"""What a model reads and what breaks it: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance``
+measures how far it follows the fringe's phase, ``fpp-bench robustness`` how its error grows when
+the scene is disturbed, axis by axis."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -49,7 +50,8 @@ from fpp_ml_bench.tables import Table
 
 
 class DiagnoseCommand(MethodCommand):
-    """A command whose options are also those of the methods without a network that is probed layer by layer."""
+    """A command whose options are also those of the methods without a network that is probed layer
+    by layer."""
 
     def methods(self, words: Sequence[str]) -> dict[str, type[Method]]:
         return registry.methods()
@@ -68,7 +70,8 @@ fpp-bench diagnose my_net.py:make data/small224 --units mm --layers encoder,deco
 def diagnose(
     *,
     model: str = argument(
-        "weights that come with the package, a .safetensors file, one of the methods below, or your own method or "
+        "weights that come with the package, a .safetensors file, one of the methods below, or "
+        "your own method or "
         "torch module as file.py:Class or file.py:factory; that file is executed",
         "MODEL",
     ),
@@ -84,11 +87,14 @@ def diagnose(
     samples: int | None = option(
         None, "most samples of a split, taken evenly (default: the probe's)", "N", parse=COUNT
     ),
-    seeds: int | None = option(None, "repeats of what depends on random numbers (default: 2)", "N", parse=COUNT),
+    seeds: int | None = option(
+        None, "repeats of what depends on random numbers (default: 2)", "N", parse=COUNT
+    ),
     frame: int | None = option(None, "number of a network's input frame (default: its first)", "N"),
     units: Literal["mm", "m", "normalised"] | None = option(
         None,
-        "output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
+        "output of your own module: depth in mm, in m, or normalised to the sample's range "
+        "(default)",
     ),
     quick: bool = option(False, "a short run for a first look; its numbers are not reliable"),
     layers: tuple[str, ...] | None = option(
@@ -97,7 +103,8 @@ def diagnose(
     threads: int | None = option(None, "threads (default: every core)", "N", parse=COUNT),
     options: dict[str, Any],
 ) -> None:
-    """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
+    """Diagnose a network or method with the paper's probes and further ones; writes an HTML report
+    and a JSON file.
 
     Raises FppBenchError for what can't be diagnosed."""
     from fpp_ml_bench.baselines.diagnostics.subjects import subject as subject_of
@@ -111,14 +118,23 @@ def diagnose(
         def progress(probe: Probe) -> Callable[[int, int, str], None]:
             task = shown.add_task(probe.title, total=None)
             return lambda done, total, activity: shown.update(
-                task, completed=done, total=total, description=printable(f"{probe.title}: {activity}")
+                task,
+                completed=done,
+                total=total,
+                description=printable(f"{probe.title}: {activity}"),
             )
 
         results = run_diagnosis(subject, opened, probe, probing, out, progress, again)
     table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(subject.title))
     for probed in results:
-        text = f"not run: {probed.finding.skipped}" if probed.finding.skipped else probed.finding.summary
-        table.add_row(probed.probe.name, Text(text), "reused" if probed.reused else f"{probed.seconds:.1f}")
+        text = (
+            f"not run: {probed.finding.skipped}"
+            if probed.finding.skipped
+            else probed.finding.summary
+        )
+        table.add_row(
+            probed.probe.name, Text(text), "reused" if probed.reused else f"{probed.seconds:.1f}"
+        )
     show(table)
     print(f"Written: {out / REPORT_FILE}\nWritten: {out / JSON_FILE}")
 
@@ -142,13 +158,19 @@ def reliance(
         parse=value("1 to 6, an object has six views", int, lambda views: 1 <= views <= 6),
     ),
     into: Path | None = option(
-        None, "write the score into this result or leaderboard row of the same method (.json)", "FILE"
+        None,
+        "write the score into this result or leaderboard row of the same method (.json)",
+        "FILE",
     ),
     json: Path | None = option(
-        None, "write the score and its parts to this file; - is standard output", "FILE", parse=new_file
+        None,
+        "write the score and its parts to this file; - is standard output",
+        "FILE",
+        parse=new_file,
     ),
 ) -> None:
-    """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?
+    """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's
+    outline?
 
     A file that can't take the score raises FppBenchError before measuring."""
     opened = DatasetFolder(dataset)
@@ -159,7 +181,9 @@ def reliance(
     samples = chosen_samples(opened, "test", views)
     with progress_bar(f"reliance of {chosen.name}", len(samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
-        measured, _ = measure_reliance(method, opened, samples, lambda done, total, sample: advance(min(done, 1)))
+        measured, _ = measure_reliance(
+            method, opened, samples, lambda done, total, sample: advance(min(done, 1))
+        )
         advance(1)
     if json is not None:
         write_json(measured.model_dump(mode="json"), json)
@@ -170,7 +194,8 @@ def reliance(
         show(_reliance_table(method.title, measured))
     else:
         print(
-            f"{method.title}: gives the same answer whatever phase, light and outline of {measured.samples} samples "
+            f"{method.title}: gives the same answer whatever phase, light and outline of "
+            f"{measured.samples} samples "
             "are, so it reads nothing of them. Phase reliance 0."
         )
 
@@ -206,23 +231,31 @@ def robust(
     pool: Pool,
     out: Path | RemoteFolder = option(
         REQUIRED,
-        "folder of measurements: each method has its own below it, and one page shows all; or a URL",
+        "folder of measurements: each method has its own below it, and one page shows all; or a "
+        "URL",
         "DIR",
         parse=place,
     ),
-    axes: tuple[str, ...] = option((), "only these axes (default: all that apply to the method)", "A,B", parse=names),
+    axes: tuple[str, ...] = option(
+        (), "only these axes (default: all that apply to the method)", "A,B", parse=names
+    ),
     objects: Literal["test", "unseen"] = option("test", "objects (default: test)", flag="--set"),
     size: int = option(FULL_SIZE, f"image size (default: {FULL_SIZE})", "PX"),
     quick: bool = option(False, "one view of each object and three severities, for a look"),
     into: Path | None = option(
-        None, "write the block into this result or row of the same method (.json); needs all axes", "FILE"
+        None,
+        "write the block into this result or row of the same method (.json); needs all axes",
+        "FILE",
     ),
     cache: Path | None = option(
-        None, "rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)", "DIR"
+        None,
+        "rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)",
+        "DIR",
     ),
     no_cache: bool = option(False, "render every frame anew, keep none"),
 ) -> None:
-    """Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation.
+    """Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the
+    image formation.
 
     A file that can't take the block raises FppBenchError before measuring."""
     workers = pool.processes
@@ -237,11 +270,17 @@ def robust(
     setup = Setup(method, objects, size, quick)
     # The nodes of a cluster have folders of their own, which nobody would keep small.
     cache = None if no_cache else cache or (None if pool.cluster else CACHE)
-    views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(axes) for c in setup.conditions(axis))
+    views = sum(
+        len(c.objects) * len(setup.views)
+        for axis in setup.axes(axes)
+        for c in setup.conditions(axis)
+    )
     with working_copy(out) as (below, save):
         folder = below / slug(setup)
         with progress_bar(f"{chosen.name}, {objects}", views, "views") as advance:
-            rows = measure_robustness(setup, folder, axes, workers, cache, advance, pool.cluster, save)
+            rows = measure_robustness(
+                setup, folder, axes, workers, cache, advance, pool.cluster, save
+            )
         page = f"{out}/{write_page(below).name}"
     if entry is not None:
         write_block(entry, robustness_block(setup, rows))
@@ -250,7 +289,8 @@ def robust(
 
 
 class Scenes(NamedTuple):
-    """What a method is chosen for, in place of a dataset: the scenes are rendered when they are needed."""
+    """What a method is chosen for, in place of a dataset: the scenes are rendered when they are
+    needed."""
 
     path: Path
     rig: Rig
@@ -280,7 +320,18 @@ def _table(setup: Setup, rows: dict[str, list[View]]) -> Table:
     for axis, found in rows.items():
         means = severity_means(found)
         last = means[max(means)]
-        cells = [millimetres(means[severity]["mae_mm"]) if severity in means else "" for severity in severities]
-        shares = [percent(last[key], 2) for key in ("wrong_share", "unanswered_share", "invented_share")]
-        table.add_row(axis, *cells, *shares, millimetres(last["answered_mae_mm"]), percent(last["confident_share"]))
+        cells = [
+            millimetres(means[severity]["mae_mm"]) if severity in means else ""
+            for severity in severities
+        ]
+        shares = [
+            percent(last[key], 2) for key in ("wrong_share", "unanswered_share", "invented_share")
+        ]
+        table.add_row(
+            axis,
+            *cells,
+            *shares,
+            millimetres(last["answered_mae_mm"]),
+            percent(last["confident_share"]),
+        )
     return table

@@ -1,4 +1,5 @@
-"""``fpp-eval``: score a folder of predictions against one split of a dataset, and work on results."""
+"""``fpp-eval``: score a folder of predictions against one split of a dataset, and work on
+results."""
 
 import sys
 from collections.abc import Callable
@@ -31,20 +32,27 @@ fpp-eval predictions data/mini --split test --target depth_exact --report report
 def score_folder(
     *,
     predictions: Path = argument(
-        "folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
-        "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
+        "folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or "
+        "one "
+        "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that "
+        "submission.yaml declares; "
         "every problem is listed by file, and then no JSON is written",
         "PREDICTIONS",
     ),
     dataset: Path | None = argument(
-        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml)", "DATASET", None
+        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml)",
+        "DATASET",
+        None,
     ),
     split: str | None = option(
-        None, "samples to score (default: those that were predicted by submission.yaml, else test)", choices=SPLITS
+        None,
+        "samples to score (default: those that were predicted by submission.yaml, else test)",
+        choices=SPLITS,
     ),
     target: str = option(
         TARGETS[0],
-        "depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the ray cast",
+        "depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the "
+        "ray cast",
         choices=TARGETS,
     ),
     edge_band: int = option(
@@ -55,19 +63,28 @@ def score_folder(
     ),
     mode: str = option(
         MODES[0],
-        "standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, and "
+        "standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's "
+        "sets, without void, and "
         "its rule for normalised depth; never ranked with the others",
         choices=MODES,
     ),
     json: Path | None = option(
-        None, "write the result here, per-sample scores included; - is standard output", "FILE", parse=new_file
+        None,
+        "write the result here, per-sample scores included; - is standard output",
+        "FILE",
+        parse=new_file,
     ),
     page: Path | None = option(
-        None, "write an HTML page with figures into this folder", "DIR", flag="--report", parse=new_folder
+        None,
+        "write an HTML page with figures into this folder",
+        "DIR",
+        flag="--report",
+        parse=new_folder,
     ),
     account: Explain,
 ) -> None:
-    """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background.
+    """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the
+    background.
 
     Raises FppBenchError for anything that can't be scored."""
     from fpp_ml_bench.evaluation.result.file import write_result
@@ -117,10 +134,15 @@ def _result_table() -> "Callable[[Result], Any]":
 
 
 def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[DatasetFolder, str]":
-    """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
-    predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
-    the dataset is gone; whether it is still the same is checked when it is scored."""
-    from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, predictions_folder, read_plain
+    """The dataset in ``place`` and the ``split`` to score; where they are not given, those that
+    ``folder`` was predicted from, by its submission.yaml. Raises `SubmissionError` where that does
+    not say, and `DatasetError` where the dataset is gone; whether it is still the same is checked
+    when it is scored."""
+    from fpp_ml_bench.evaluation.submission.prediction_files import (
+        SUBMISSION_FILE,
+        predictions_folder,
+        read_plain,
+    )
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     shown, predicted_from = printable(str(folder), 500), Path()
@@ -135,13 +157,17 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[D
     except (AttributeError, KeyError, TypeError):
         if place is None:
             file = SUBMISSION_FILE
-            raise SubmissionError(f"{shown}: {file} does not say (predicted:) what was predicted; {give}") from None
+            raise SubmissionError(
+                f"{shown}: {file} does not say (predicted:) what was predicted; {give}"
+            ) from None
     if place is not None:
         return DatasetFolder(place), split or "test"
     try:
         dataset = DatasetFolder(predicted_from)
     except DatasetError as error:
-        raise DatasetError(f"{error}. {shown} was predicted from there; if the data was moved, {give}") from None
+        raise DatasetError(
+            f"{error}. {shown} was predicted from there; if the data was moved, {give}"
+        ) from None
     return dataset, split or "test"
 
 
@@ -167,7 +193,10 @@ def init(
     from fpp_ml_bench.evaluation.submission.description import write_template
 
     print(f"Written: {write_template(predictions)}")
-    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {predictions}")
+    print(
+        f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval "
+        f"check {predictions}"
+    )
 
 
 @command(
@@ -179,7 +208,9 @@ fpp-eval check predictions data/mini --split test
 def check(
     *,
     predictions: Path = argument("folder of predictions and submission.yaml", "PREDICTIONS"),
-    dataset: Path | None = argument("check names, sizes and frames against this dataset, too", "DATASET", None),
+    dataset: Path | None = argument(
+        "check names, sizes and frames against this dataset, too", "DATASET", None
+    ),
     split: str = option("test", "samples expected with DATASET (default: test)", choices=SPLITS),
 ) -> int:
     """Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.
@@ -194,17 +225,26 @@ def check(
     for note in checked.notes:
         print(f"fpp-eval: note: {note}", file=sys.stderr)
     if checked.problems:
-        print(f"{folder} would be refused, {len(checked.problems)} problem{'s' * (len(checked.problems) > 1)}:")
+        print(
+            f"{folder} would be refused, {len(checked.problems)} "
+            f"problem{'s' * (len(checked.problems) > 1)}:"
+        )
         for line in checked.problems:
             print(f"  {line}")
         return CHECK_FAILED
     height, width = checked.size
     listing, sigma = checked.listing, ", with an uncertainty" if checked.listing.sigmas else ""
     against = "" if dataset is None else f" of split {split}"
-    print(f"{folder}: {len(listing.present)} samples{against}, {listing.form}, {width}x{height} px{sigma}; sound")
+    print(
+        f"{folder}: {len(listing.present)} samples{against}, {listing.form}, {width}x{height} "
+        f"px{sigma}; sound"
+    )
     if checked.description is not None:
         frames, track = len(checked.description.frames_used), checked.description.track
-        print(f"submission.yaml: {track} track, {frames} {'frame' if frames == 1 else 'frames'}; sound")
+        print(
+            f"submission.yaml: {track} track, {frames} {'frame' if frames == 1 else 'frames'}; "
+            f"sound"
+        )
     return OK
 
 
@@ -217,12 +257,18 @@ fpp-eval compare a.json b.json --json difference.json
 def compare(
     *,
     first: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "A.json"),
-    second: Path = argument("a result of another method on the same data, split, target and track", "B.json"),
+    second: Path = argument(
+        "a result of another method on the same data, split, target and track", "B.json"
+    ),
     json: Path | None = option(
-        None, "write the comparison here, each sample's included; - is standard output", "FILE", parse=new_file
+        None,
+        "write the comparison here, each sample's included; - is standard output",
+        "FILE",
+        parse=new_file,
     ),
 ) -> None:
-    """Compare two results of the same samples: paired differences, their 95% intervals, and a sentence on them.
+    """Compare two results of the same samples: paired differences, their 95% intervals, and a
+    sentence on them.
 
     Raises SubmissionError for results that can't be compared."""
     from fpp_ml_bench.cli.console import show
@@ -245,12 +291,14 @@ fpp-eval verify leaderboard/rows/mine.json predictions data/full
 )
 def verify(
     *,
-    file: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "RESULT.json"),
+    file: Path = argument(
+        "a result of fpp-eval --json, or a row of the leaderboard", "RESULT.json"
+    ),
     predictions: Path = argument("the predictions it was made from", "PREDICTIONS"),
     dataset: Path = argument("folder of the dataset", "DATASET"),
 ) -> int:
-    """Score the predictions again and say whether the result or row is verified, or the same within what processors
-    change (exit status 0), or not the same (1).
+    """Score the predictions again and say whether the result or row is verified, or the same within
+    what processors change (exit status 0), or not the same (1).
 
     Raises FppBenchError where nothing can be recomputed at all."""
     from fpp_ml_bench.evaluation.result.model import Result
@@ -268,8 +316,10 @@ def verify(
         return OK
     if found.processors:
         print(
-            f"the same within what processors change: {shown} and what {samples} predictions give. These are other "
-            f"predictions, but each error differs by at most {verification.PROCESSOR_ERROR:.1%} and what "
+            f"the same within what processors change: {shown} and what {samples} predictions give. "
+            f"These are other "
+            f"predictions, but each error differs by at most {verification.PROCESSOR_ERROR:.1%} "
+            f"and what "
             f"{verification.PROCESSOR_PIXELS:.2%} of the pixels can make, and their means by what "
             f"{verification.PROCESSOR_MEAN_PIXELS:.3%} can\n{unchecked}"
         )
@@ -292,7 +342,8 @@ fpp-eval schema submission
 def schema(
     *,
     file: str = argument(
-        "result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
+        "result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval "
+        "compare --json",
         "result|submission|comparison",
         "result",
         choices=("result", "submission", "comparison"),

@@ -46,11 +46,17 @@ class CaptureSettings:
 
     HEADING = "captures without depth"
     splits: Path | None = option(
-        None, "YAML lists of objects under train, validation and test (default: all in test)", "FILE"
+        None,
+        "YAML lists of objects under train, validation and test (default: all in test)",
+        "FILE",
     )
-    bits: int | None = option(None, "bits of the camera, 8 to 16 (default: found in the images)", "N")
+    bits: int | None = option(
+        None, "bits of the camera, 8 to 16 (default: found in the images)", "N"
+    )
     colour: str | None = option(
-        None, "what to take of colour images: luminance, red, green, blue or mean (default: refuse them)", "NAME"
+        None,
+        "what to take of colour images: luminance, red, green, blue or mean (default: refuse them)",
+        "NAME",
     )
     min_modulation: float | None = option(
         None, "least modulation of a pixel with depth, grey levels of 255 (default: 5)", "GREY"
@@ -60,7 +66,9 @@ class CaptureSettings:
     )
     anyway: bool = option(False, "import captures that their examination refuses, too")
     max_disagreement: float | None = option(
-        None, "largest distance of both directions' coordinates from the epipolar line (default: 1.5)", "PX"
+        None,
+        "largest distance of both directions' coordinates from the epipolar line (default: 1.5)",
+        "PX",
     )
 
 
@@ -70,7 +78,9 @@ class HubSettings:
 
     HEADING = "a dataset of the Hugging Face Hub"
     revision: str | None = option(None, "branch, tag or commit (default: its main branch)", "REV")
-    raw_scans: bool = option(False, "fetch the raw scans, too; --fit-rig and --frame-order imply it")
+    raw_scans: bool = option(
+        False, "fetch the raw scans, too; --fit-rig and --frame-order imply it"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,18 +88,27 @@ class ImportSettings(HubSettings, CaptureSettings):
     """Settings of `import_tree`."""
 
     tree: Path = argument(
-        "folder that holds training_datasets/, or captures; or OWNER/NAME on the Hugging Face Hub", "TREE"
+        "folder that holds training_datasets/, or captures; or OWNER/NAME on the Hugging Face Hub",
+        "TREE",
     )
     out: Path = option(REQUIRED, "new folder, or the folder of an interrupted import", "DIR")
-    workers: int | None = option(None, "processes (default: one per processor)", "N", parse=AT_LEAST_ONE)
+    workers: int | None = option(
+        None, "processes (default: one per processor)", "N", parse=AT_LEAST_ONE
+    )
     captures: bool = option(False, "TREE holds captures, which --rig decodes into the ground truth")
-    rig: Path | None = option(None, "rig that took the images, YAML or JSON (default: the paper's, scaled)", "FILE")
-    fit_rig: bool = option(False, "find projector and pitch from raw scans and depth (fpp-bench calibrate)")
+    rig: Path | None = option(
+        None, "rig that took the images, YAML or JSON (default: the paper's, scaled)", "FILE"
+    )
+    fit_rig: bool = option(
+        False, "find projector and pitch from raw scans and depth (fpp-bench calibrate)"
+    )
     frame_order: str = option(
         "auto", "order of the raw scans' files (default: auto, determined from the images)", "NAME"
     )
     nodata: float | None = option(
-        None, "value of a tree's depth files where no surface is, in their unit (default: 0)", "VALUE"
+        None,
+        "value of a tree's depth files where no surface is, in their unit (default: 0)",
+        "VALUE",
     )
 
 
@@ -117,17 +136,24 @@ into the ground truth. splits.yaml lists the objects under train, validation and
 """
 )
 def import_tree(settings: ImportSettings) -> None:
-    """Read a published tree (PNG fringes, .mat depth, raw scans), or the captures of a scanner, into the same dataset
-    format as a build.
+    """Read a published tree (PNG fringes, .mat depth, raw scans), or the captures of a scanner,
+    into the same dataset format as a build.
 
     Prints a summary. Raises FppBenchError for an unusable tree, captures, rig or folder."""
-    from_hub = REPOSITORY_NAME.fullmatch(str(settings.tree)) and not settings.tree.exists() and not settings.captures
+    from_hub = (
+        REPOSITORY_NAME.fullmatch(str(settings.tree))
+        and not settings.tree.exists()
+        and not settings.captures
+    )
     if (of_hub := given(settings, HubSettings)) and not from_hub:
         raise BuildError(
-            f"{of_hub[0]} belongs to a dataset of the Hub, given as OWNER/NAME; {settings.tree} is a folder"
+            f"{of_hub[0]} belongs to a dataset of the Hub, given as OWNER/NAME; {settings.tree} is "
+            f"a folder"
         )
     if settings.rig is not None and settings.fit_rig:
-        raise BuildError("--rig and --fit-rig: the first gives the rig that the second finds; give one of them")
+        raise BuildError(
+            "--rig and --fit-rig: the first gives the rig that the second finds; give one of them"
+        )
     if settings.captures:
         _import_captures(settings)
     else:
@@ -137,12 +163,18 @@ def import_tree(settings: ImportSettings) -> None:
 def _import_captures(settings: ImportSettings) -> None:
     if settings.rig is None:
         raise BuildError(
-            "--captures: the rig that took them is missing; give its file with --rig (fpp-bench calibrate)"
+            "--captures: the rig that took them is missing; give its file with --rig (fpp-bench "
+            "calibrate)"
         )
     if settings.frame_order != "auto":
-        raise BuildError("--frame-order belongs to published trees; captures have the order of their rig's sequence")
+        raise BuildError(
+            "--frame-order belongs to published trees; captures have the order of their rig's "
+            "sequence"
+        )
     if settings.nodata is not None:
-        raise BuildError("--nodata belongs to published trees; captures have no depth yet: leave it out")
+        raise BuildError(
+            "--nodata belongs to published trees; captures have no depth yet: leave it out"
+        )
     options: dict[str, Any] = {
         "min_modulation": settings.min_modulation,
         "max_clipped_steps": settings.max_clipped_steps,
@@ -151,7 +183,13 @@ def _import_captures(settings: ImportSettings) -> None:
     limits = Limits(**{name: value for name, value in options.items() if value is not None})
     splits = None if settings.splits is None else read_splits(settings.splits)
     plan = plan_captures(
-        settings.tree, load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
+        settings.tree,
+        load_rig(settings.rig),
+        splits,
+        limits,
+        settings.bits,
+        settings.colour,
+        settings.anyway,
     )
     manifest, seconds = _written(settings, plan)
     _print_captures(manifest)
@@ -169,15 +207,32 @@ def _written(settings: ImportSettings, plan: Assembly[RowReader]) -> tuple[Manif
 def _print_captures(manifest: "Manifest") -> None:
     """Print what was decoded of each capture, those with the least first where there are many."""
     rows = [row for part in manifest.samples.values() for row in part]
-    shown = rows if len(rows) <= _MOST_SHOWN else sorted(rows, key=lambda row: row["decoded_share"])[:_MOST_SHOWN]
+    shown = (
+        rows
+        if len(rows) <= _MOST_SHOWN
+        else sorted(rows, key=lambda row: row["decoded_share"])[:_MOST_SHOWN]
+    )
     reasons = [reason.name.lower() for reason in Reason]
     reasons = [name for name in reasons if any(name in row["refused_share"] for row in shown)]
-    more = f", the {len(shown)} of {len(rows)} captures with the least decoded" if len(shown) < len(rows) else ""
+    more = (
+        f", the {len(shown)} of {len(rows)} captures with the least decoded"
+        if len(shown) < len(rows)
+        else ""
+    )
     titles = "decoded", "modulation", *(name.replace("_", " ") for name in reasons)
-    table = Table("", numbers=titles, title=f"pixels decoded, their median modulation, and pixels refused{more}")
+    table = Table(
+        "",
+        numbers=titles,
+        title=f"pixels decoded, their median modulation, and pixels refused{more}",
+    )
     for row in shown:
         refused = (f"{100 * row['refused_share'].get(name, 0.0):.1f}%" for name in reasons)
-        table.add_row(row["sample"], f"{100 * row['decoded_share']:.1f}%", f"{row['median_modulation']:.1f}", *refused)
+        table.add_row(
+            row["sample"],
+            f"{100 * row['decoded_share']:.1f}%",
+            f"{row['median_modulation']:.1f}",
+            *refused,
+        )
     show(table)
 
 
@@ -189,18 +244,29 @@ def _print_end(out: Path, manifest: "Manifest", seconds: float, notes: list[str]
 
 
 def _fetch(settings: ImportSettings) -> tuple[Path, Source]:
-    """Download what the import needs of a dataset of the Hub: the folder of its tree, and where it is from."""
-    from fpp_ml_bench.loaders.hub import Hub, fetch_tree, plan_download  # imports huggingface_hub, which others don't
+    """Download what the import needs of a dataset of the Hub: the folder of its tree, and where it
+    is from."""
+    from fpp_ml_bench.loaders.hub import (
+        Hub,
+        fetch_tree,
+        plan_download,
+    )  # imports huggingface_hub, which others don't
 
     hub = Hub(sending=False)
     raw_scans = settings.raw_scans or settings.fit_rig or settings.frame_order != "auto"
     download = plan_download(hub, str(settings.tree), settings.revision, raw_scans)
-    source, revision = download.source, "" if settings.revision is None else f" ({printable(settings.revision, 60)})"
+    source, revision = (
+        download.source,
+        "" if settings.revision is None else f" ({printable(settings.revision, 60)})",
+    )
     print(f"{hub.url('dataset', source.repository)} at commit {source.commit}{revision}")
     print(f"  needed: {', '.join((*source.folders, INFO))}: {_amount(download.sizes)}")
     print(f"  to download: {_amount(download.missing)}, into {download.cache} (HF_HOME)")
     if download.raw_scans:
-        print(f"  not needed: images of raw scans, {_amount(download.raw_scans)}; --raw-scans fetches them, too")
+        print(
+            f"  not needed: images of raw scans, {_amount(download.raw_scans)}; --raw-scans "
+            f"fetches them, too"
+        )
     sys.stdout.flush()  # into a file or pipe, too, it is said before the download
     return fetch_tree(hub, download, settings.out), source
 
@@ -214,7 +280,10 @@ def _import_tree(settings: ImportSettings, from_hub: bool) -> None:
         raise BuildError(f"{of_captures[0]} belongs to captures without depth; give --captures too")
     rig = None if settings.rig is None else load_rig(settings.rig)
     if not from_hub and REPOSITORY_NAME.fullmatch(str(settings.tree)) and settings.tree.is_dir():
-        print(f"{settings.tree}: reading this folder, not a dataset of that name on the Hugging Face Hub")
+        print(
+            f"{settings.tree}: reading this folder, not a dataset of that name on the Hugging Face "
+            f"Hub"
+        )
     tree, source = _fetch(settings) if from_hub else (settings.tree, None)
     plan = plan_import(tree, rig, settings.frame_order, source, settings.nodata)
     if settings.fit_rig:
@@ -227,7 +296,9 @@ def _import_tree(settings: ImportSettings, from_hub: bool) -> None:
     _print_end(settings.out, manifest, seconds, import_notes(manifest))
     if holds_whole_numbers(plan.rows):
         print(
-            "warning: the depth files hold whole numbers, so depth is rounded; write single or double", file=sys.stderr
+            "warning: the depth files hold whole numbers, so depth is rounded; write single or "
+            "double",
+            file=sys.stderr,
         )
     difference_mm = depth_difference_mm(plan.rows)
     if difference_mm is None or difference_mm <= AGREEING_MM:
@@ -235,10 +306,16 @@ def _import_tree(settings: ImportSettings, from_hub: bool) -> None:
     if reading := depth_reading(plan.rows):
         print(f"warning: {reading}", file=sys.stderr)
     elif rig is None:
-        off = f"{difference_mm:.1f} mm off in the median" if difference_mm < float("inf") else "none at most pixels"
+        off = (
+            f"{difference_mm:.1f} mm off in the median"
+            if difference_mm < float("inf")
+            else "none at most pixels"
+        )
         print(
-            f"warning: the paper's rig did not take these raw scans: the depth it decodes from the first is {off}. "
-            f"Find their rig by fpp-bench calibrate --from-depth {tree} --out rig.yaml and import with --rig rig.yaml, "
+            f"warning: the paper's rig did not take these raw scans: the depth it decodes from the "
+            f"first is {off}. "
+            f"Find their rig by fpp-bench calibrate --from-depth {tree} --out rig.yaml and import "
+            f"with --rig rig.yaml, "
             "or import with --fit-rig",
             file=sys.stderr,
         )

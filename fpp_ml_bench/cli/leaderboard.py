@@ -13,13 +13,28 @@ from fpp_ml_bench.leaderboard.ranking import discover, expand, read_entries, shi
 from fpp_ml_bench.leaderboard.ranking import rank as rank_files
 from fpp_ml_bench.leaderboard.row_file import write_row
 from fpp_ml_bench.leaderboard.rows import read_entry, vouching_line
-from fpp_ml_bench.leaderboard.tables import chosen_tables, group_tables, paper_rich_tables, table_csv, table_json
+from fpp_ml_bench.leaderboard.tables import (
+    chosen_tables,
+    group_tables,
+    paper_rich_tables,
+    table_csv,
+    table_json,
+)
 from fpp_ml_bench.leaderboard.tables import markdown as board_markdown
 from fpp_ml_bench.options import argument, option
 
 _SORTED = tuple(dict.fromkeys((*METRICS, *sort_keys())))
 """Also those that the ranking refuses, since a method could lead by answering few pixels."""
-_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "oracle_order", "all", "none")
+_TABLES = (
+    "normalization",
+    "background_removed",
+    "multi_frame",
+    "loss",
+    "architecture",
+    "oracle_order",
+    "all",
+    "none",
+)
 
 
 @command(
@@ -37,7 +52,8 @@ fpp-bench leaderboard result.json --row leaderboard/rows/mine.json
 def rank(
     *,
     results: tuple[Path, ...] = argument(
-        "result files, or folders of them (default: the rows shipped with the package, ./result*.json and "
+        "result files, or folders of them (default: the rows shipped with the package, "
+        "./result*.json and "
         "./results/*.json)",
         "RESULT.json",
         (),
@@ -45,32 +61,40 @@ def rank(
     ),
     sort: str = option(
         RANK_KEY,
-        f"what to rank by (default: {RANK_KEY}, and {OBJECT_KEY} by the paper's rules): {', '.join(sort_keys())}",
+        f"what to rank by (default: {RANK_KEY}, and {OBJECT_KEY} by the paper's rules): "
+        f"{', '.join(sort_keys())}",
         "KEY",
         choices=_SORTED,
     ),
     markdown: Path | None = option(None, "also write the tables as Markdown", "FILE"),
     json: Path | None = option(
-        None, "also write the ranking as JSON, with the tests of all pairs; - is standard output", "FILE"
+        None,
+        "also write the ranking as JSON, with the tests of all pairs; - is standard output",
+        "FILE",
     ),
     csv: Path | None = option(None, "also write a line for each row, with all digits", "FILE"),
-    pairs: bool = option(False, "also print every pair of ranked rows: difference, interval, p value, who is behind"),
+    pairs: bool = option(
+        False, "also print every pair of ranked rows: difference, interval, p value, who is behind"
+    ),
     paper: str | None = option(
         None,
-        f"tables of the paper and of others: {', '.join(_TABLES)} (default: architecture, normalization, oracle_order, "
+        f"tables of the paper and of others: {', '.join(_TABLES)} (default: architecture, "
+        f"normalization, oracle_order, "
         "in the terminal only where no results are named)",
         "TABLE",
         choices=_TABLES,
     ),
     out: Path | None = option(
         None,
-        "write the static page of the shipped rows, or of those given: index.html and a page for each submission",
+        "write the static page of the shipped rows, or of those given: index.html and a page for "
+        "each submission",
         "DIR",
         flag="--page",
     ),
     predictions: tuple[Path, ...] = option(
         (),
-        "with --page: a folder of predictions that a named result was scored from; the row's own page then shows the "
+        "with --page: a folder of predictions that a named result was scored from; the row's own "
+        "page then shows the "
         "median and the worst sample, and a point cloud; repeatable",
         "FOLDER",
         parse=Path,
@@ -78,7 +102,8 @@ def rank(
     ),
     row_file: Path | None = option(
         None,
-        "make a row file for the leaderboard of the given result, and print what a maintainer adds to "
+        "make a row file for the leaderboard of the given result, and print what a maintainer adds "
+        "to "
         "leaderboard/vouched.txt to vouch for it",
         "FILE",
         flag="--row",
@@ -90,16 +115,22 @@ def rank(
     if predictions and out is None:
         raise SubmissionError("--predictions adds pictures to a page; give it with --page DIR")
     if out is not None and sort != RANK_KEY:
-        raise SubmissionError(f"--page is by {RANK_KEY}, and a click sorts it otherwise; leave out --sort")
+        raise SubmissionError(
+            f"--page is by {RANK_KEY}, and a click sorts it otherwise; leave out --sort"
+        )
     if row_file is not None:
         if len(results) != 1:
             raise SubmissionError(f"--row makes a row of one result, {len(results)} were given")
         row = read_entry(results[0]).row
         data = write_row(row, row_file)
-        print(f"{row_file}: {len(data):,} bytes, self-reported until a maintainer adds to leaderboard/vouched.txt:")
+        print(
+            f"{row_file}: {len(data):,} bytes, self-reported until a maintainer adds to "
+            f"leaderboard/vouched.txt:"
+        )
         print(vouching_line(row, data, "measured", "THE COMMAND THAT MAKES IT AGAIN"))
         return
-    # A page holds the shipped rows or the named files, never results that happen to be in the current folder.
+    # A page holds the shipped rows or the named files, never results that happen to be in the
+    # current folder.
     unnamed = discover(Path.cwd()) if out is None else shipped_rows()
     entries = read_entries(expand(results) if results else unnamed)
     groups, papers = rank_files(entries, sort), chosen_tables(paper)
@@ -118,6 +149,7 @@ def rank(
     show(*tables, *paper_rich_tables(papers[not_shown:]))
     if not_shown:
         print(
-            f"Not shown: {not_shown} tables that others reported on other data (--paper all), and the "
+            f"Not shown: {not_shown} tables that others reported on other data (--paper all), and "
+            f"the "
             f"leaderboard's own {len(shipped_rows())} rows (fpp-bench leaderboard without a file)."
         )

@@ -1,4 +1,5 @@
-"""Commands that take a METHOD: its options on the command line are the fields of its class, whoever wrote it."""
+"""Commands that take a METHOD: its options on the command line are the fields of its class, whoever
+wrote it."""
 
 import shlex
 import sys
@@ -27,12 +28,14 @@ NO_OPTIONS = [("no options", "")]
 
 @dataclass(frozen=True, kw_only=True)
 class MethodSettings:
-    """Which method a command runs, and how. ``options``: those of the method that the command line gives, by the names
-    of its fields."""
+    """Which method a command runs, and how. ``options``: those of the method that the command line
+    gives, by the names of its fields."""
 
     name: str = argument(
-        "one of those below with their options, the name of weights that come with the package, a .safetensors file, a "
-        "recipe that fpp-bench reproduce has trained (loss/l1), or file.py:Class, a method of yours; that file is "
+        "one of those below with their options, the name of weights that come with the package, a "
+        ".safetensors file, a "
+        "recipe that fpp-bench reproduce has trained (loss/l1), or file.py:Class, a method of "
+        "yours; that file is "
         "executed",
         "METHOD",
     )
@@ -40,8 +43,9 @@ class MethodSettings:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def load(self, dataset: "Photographed", warn: bool = True) -> Method:
-        """The method for the rig of ``dataset``. Unless told not to, warns on standard error about weights that were
-        trained on another version of the dataset's benchmark. Raises FppBenchError for an unknown method."""
+        """The method for the rig of ``dataset``. Unless told not to, warns on standard error about
+        weights that were trained on another version of the dataset's benchmark. Raises
+        FppBenchError for an unknown method."""
         known = [entry.name for entry in fields(registry.find(self.name).method.Options)]
         threads = {"threads": self.threads} if "threads" in known else {}
         method = registry.load_method(self.name, dataset, **self.options, **threads)
@@ -53,18 +57,24 @@ class MethodSettings:
 
 
 class MethodCommand(Command):
-    """A command whose first argument names a method, and whose options are also those of all methods, and of a
-    ``file.py:Class`` among its words. Those that are given of the method named are ``options`` of its function or of a
-    dataclass among its parameters."""
+    """A command whose first argument names a method, and whose options are also those of all
+    methods, and of a ``file.py:Class`` among its words. Those that are given of the method named
+    are ``options`` of its function or of a dataclass among its parameters."""
 
     part = "Options"
 
     def methods(self, words: Sequence[str]) -> dict[str, type[Method]]:
-        """The methods by what the command line calls them, the user's own first: where two share a flag, the first says
-        whether a value stands behind it."""
-        own = {word: registry.find(word).method for word in words if registry.FILE_MARK in word and word[0] != "-"}
+        """The methods by what the command line calls them, the user's own first: where two share a
+        flag, the first says whether a value stands behind it."""
+        own = {
+            word: registry.find(word).method
+            for word in words
+            if registry.FILE_MARK in word and word[0] != "-"
+        }
         every = {**own, **registry.methods(), "": registry.network_method()}
-        return {name: method for name, method in every.items() if getattr(method, self.part) is not None}
+        return {
+            name: method for name, method in every.items() if getattr(method, self.part) is not None
+        }
 
     def fields_of(self, method: type[Method]) -> "dict[str, Field[Any]]":
         """The options of a method by their flag."""
@@ -73,30 +83,50 @@ class MethodCommand(Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         methods, of_command = self.methods(args), flags_of(ctx)
         of_methods: dict[str, Any] = {}
-        for flag, entry in (entry for method in methods.values() for entry in self.fields_of(method).items()):
+        for flag, entry in (
+            entry for method in methods.values() for entry in self.fields_of(method).items()
+        ):
             if flag not in (*of_command, *of_methods):
                 # Its text stays as it is until METHOD is known; sections of their own list it.
                 made = of_methods[flag] = parameter_of(entry)
-                made.name, made.type, made.default, made.hidden = flag, click.UNPROCESSED, None, True
+                made.name, made.type, made.default, made.hidden = (
+                    flag,
+                    click.UNPROCESSED,
+                    None,
+                    True,
+                )
         ctx.meta[_OF_METHODS] = [*of_methods.values()]
         super().parse_args(ctx, args)
-        name, *others = (str(ctx.params[str(p.name)]) for p in self.params if isinstance(p, click.Argument))
+        name, *others = (
+            str(ctx.params[str(p.name)]) for p in self.params if isinstance(p, click.Argument)
+        )
         known = {*methods, *shipped_names()}
         if name not in known and others and (is_file(Path(name) / MANIFEST) or others[0] in known):
             said = shlex.join([others[0], name])
-            raise PredictionError(f"{name}: expected the method first, then the dataset: {ctx.command_path} {said}")
+            raise PredictionError(
+                f"{name}: expected the method first, then the dataset: {ctx.command_path} {said}"
+            )
         method = methods.get(name, methods.get(""))
         own = {} if method is None else self.fields_of(method)
         if clash := [flag for flag in own if flag in of_command]:
-            raise PredictionError(f"{name}: its option {clash[0]} is one of {ctx.command_path}; give it another flag")
+            raise PredictionError(
+                f"{name}: its option {clash[0]} is one of {ctx.command_path}; give it another flag"
+            )
         given = {flag: text for flag in of_methods if (text := ctx.params[flag]) not in (None, ())}
         if of_others := [flag for flag in given if flag not in own]:
             if name not in methods and registry.FILE_MARK not in name:
                 registry.find(name)  # says what else was probably meant
-            owners = [label_of(other) for other in methods.values() if of_others[0] in self.fields_of(other)]
-            raise PredictionError(f"{of_others[0]} is an option of {', '.join(owners)}, not of {name}; leave it out")
+            owners = [
+                label_of(other)
+                for other in methods.values()
+                if of_others[0] in self.fields_of(other)
+            ]
+            raise PredictionError(
+                f"{of_others[0]} is an option of {', '.join(owners)}, not of {name}; leave it out"
+            )
         ctx.params["options"] = {
-            own[flag].name: parameter_of(own[flag]).type_cast_value(ctx, text) for flag, text in given.items()
+            own[flag].name: parameter_of(own[flag]).type_cast_value(ctx, text)
+            for flag, text in given.items()
         }
         return []
 
@@ -107,7 +137,9 @@ class MethodCommand(Command):
         sections = super().sections(ctx)
         for method in self.methods(ctx.obj).values():
             params = [parameter_of(entry) for entry in self.fields_of(method).values()]
-            sections[f"{label_of(method)} ({method.purpose})"] = [row_of(p, ctx) for p in params] or NO_OPTIONS
+            sections[f"{label_of(method)} ({method.purpose})"] = [
+                row_of(p, ctx) for p in params
+            ] or NO_OPTIONS
         return sections
 
     def invoke(self, ctx: click.Context) -> int:

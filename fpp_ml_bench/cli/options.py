@@ -1,5 +1,5 @@
-"""Commands made of dataclasses: the fields of a command's settings are its arguments and options, and its function gets
-an instance."""
+"""Commands made of dataclasses: the fields of a command's settings are its arguments and options,
+and its function gets an instance."""
 
 import json
 import shlex
@@ -38,9 +38,11 @@ Row = tuple[str, str]
 # ---- how the text of an option becomes its value
 
 
-def value(expected: str, parse: Callable[[str], Any], sound: Callable[[Any], bool] = lambda result: True) -> Any:
-    """``parse`` of an option: text that ``parse`` makes a ``sound`` value of, without ValueError; else it says what was
-    ``expected``."""
+def value(
+    expected: str, parse: Callable[[str], Any], sound: Callable[[Any], bool] = lambda result: True
+) -> Any:
+    """``parse`` of an option: text that ``parse`` makes a ``sound`` value of, without ValueError;
+    else it says what was ``expected``."""
 
     def parsed(text: str) -> Any:
         with suppress(ValueError):
@@ -89,23 +91,34 @@ def whole(least: int, most: int, unit: str = "") -> Any:
 COUNT = whole(1, 100_000)
 AT_LEAST_ONE = value("1 or more", int, lambda number: number >= 1)
 MINUTES = value("minutes above 0", float, lambda minutes: 0 < minutes < 1e6)
-WORKING_RANGE = value("NEAR,FAR in mm such as 350,450", number_pair, lambda ends: 0 < ends[0] < ends[1] < 1e9)
+WORKING_RANGE = value(
+    "NEAR,FAR in mm such as 350,450", number_pair, lambda ends: 0 < ends[0] < ends[1] < 1e9
+)
 
 
 def parser_of(entry: "Field[Any]") -> Callable[[str], Any]:
-    """What makes the value of a field of its text: its own ``parse``, else by its choices or its type."""
+    """What makes the value of a field of its text: its own ``parse``, else by its choices or its
+    type."""
     about, kinds = described(entry), _kinds(entry)
     if about.parse is not None:
         return about.parse
     if choices := choices_of(entry):
         return partial(_choice, choices)
-    plain = {"str": str, "float": value("a number", float), "int": value("a whole number", int), "Path": Path}
+    plain = {
+        "str": str,
+        "float": value("a number", float),
+        "int": value("a whole number", int),
+        "Path": Path,
+    }
     return next((plain[kind] for kind in plain if kind in kinds), str)
 
 
 def choices_of(entry: "Field[Any]") -> tuple[str, ...]:
-    """The values that a field may have: those that it says, or those of a ``Literal`` in its annotation."""
-    literal = next((kind for kind in (entry.type, *get_args(entry.type)) if get_origin(kind) is Literal), None)
+    """The values that a field may have: those that it says, or those of a ``Literal`` in its
+    annotation."""
+    literal = next(
+        (kind for kind in (entry.type, *get_args(entry.type)) if get_origin(kind) is Literal), None
+    )
     return described(entry).choices or get_args(literal)
 
 
@@ -116,7 +129,8 @@ def _choice(choices: tuple[str, ...], text: str) -> str:
 
 
 def _kinds(entry: "Field[Any]") -> set[str]:
-    """Names of the types in a field's annotation, which may name types that only a type checker imports."""
+    """Names of the types in a field's annotation, which may name types that only a type checker
+    imports."""
     annotation = entry.type
     if isinstance(annotation, str):
         return {part.strip() for part in annotation.split("|")}
@@ -124,7 +138,8 @@ def _kinds(entry: "Field[Any]") -> set[str]:
 
 
 class _Value(click.ParamType[Any]):
-    """The value that ``parse`` makes of the text of an option or argument. Defaults are values already."""
+    """The value that ``parse`` makes of the text of an option or argument. Defaults are values
+    already."""
 
     name = "value"
 
@@ -136,7 +151,9 @@ class _Value(click.ParamType[Any]):
             return value
         called = param.opts[0] if isinstance(param, click.Option) else param.make_metavar(ctx)
         if value in flags_of(ctx):
-            raise click.UsageError(f"{called}: expected a value behind it, got the option {value}", ctx)
+            raise click.UsageError(
+                f"{called}: expected a value behind it, got the option {value}", ctx
+            )
         try:
             return self.parse(value)
         except ValueError as error:
@@ -151,10 +168,13 @@ class Pool:
     """Settings of a command whose work may go to several processes or machines."""
 
     HEADING = "where it runs"
-    workers: int | None = option(None, "processes (default: as many as there are processors)", "N", parse=AT_LEAST_ONE)
+    workers: int | None = option(
+        None, "processes (default: as many as there are processors)", "N", parse=AT_LEAST_ONE
+    )
     cluster: str | None = option(
         None,
-        "all CPUs of a Ray cluster instead: ray://HOST:10001, or HOST:6379 on one of its nodes; they must share the "
+        "all CPUs of a Ray cluster instead: ray://HOST:10001, or HOST:6379 on one of its nodes; "
+        "they must share the "
         "output folder, or write to a URL (docs/data.md)",
         "ADDRESS",
     )
@@ -163,7 +183,10 @@ class Pool:
     def processes(self) -> int:
         """Processes of this machine. Raises `PoolError` for a number beside a cluster."""
         if self.workers is not None and self.cluster is not None:
-            raise PoolError("--workers counts processes of this machine, --cluster takes a cluster; give one of them")
+            raise PoolError(
+                "--workers counts processes of this machine, --cluster takes a cluster; give one "
+                "of them"
+            )
         return self.workers or usable_cores()
 
 
@@ -180,7 +203,10 @@ class Explain:
     def say(self, account: Callable[[], "Explanation"]) -> None:
         """Print the account as a table, and write it as JSON, if asked for."""
         if self.explain or self.explain_json:
-            from fpp_ml_bench.cli.console import explanation_table, show  # imports rich, which --help must not
+            from fpp_ml_bench.cli.console import (
+                explanation_table,
+                show,
+            )  # imports rich, which --help must not
 
             explanation = account()
             show(explanation_table(explanation))
@@ -192,7 +218,11 @@ class Explain:
 
 def given(settings: Any, part: type) -> list[str]:
     """Flags of the options of the base class ``part`` that don't have their default."""
-    return [flag_of(entry) for entry in options_of(part) if getattr(settings, entry.name) != entry.default]
+    return [
+        flag_of(entry)
+        for entry in options_of(part)
+        if getattr(settings, entry.name) != entry.default
+    ]
 
 
 def command_line() -> str:
@@ -206,8 +236,14 @@ def command_line() -> str:
 
 def parameter_of(entry: "Field[Any]", heading: str = OPTIONS) -> Any:
     """The click.Option or click.Argument that a field is, listed in the help below ``heading``."""
-    about, required, words = described(entry), entry.default is MISSING, [flag_of(entry), entry.name]
-    told: dict[str, Any] = {"help": about.help} if required else {"help": about.help, "default": entry.default}
+    about, required, words = (
+        described(entry),
+        entry.default is MISSING,
+        [flag_of(entry), entry.name],
+    )
+    told: dict[str, Any] = (
+        {"help": about.help} if required else {"help": about.help, "default": entry.default}
+    )
     shown = about.metavar or "|".join(choices_of(entry))
     valued = {"type": _Value(parser_of(entry)), "required": required, "metavar": shown, **told}
     if about.positional:
@@ -221,9 +257,9 @@ def parameter_of(entry: "Field[Any]", heading: str = OPTIONS) -> Any:
 
 
 class Command(click.Command):
-    """A command that runs ``function``. Its keyword parameters are arguments and options by their defaults, made with
-    `argument` and `option`, or dataclasses of such fields, of which it gets an instance. With ``--json -`` standard
-    output gets the JSON alone."""
+    """A command that runs ``function``. Its keyword parameters are arguments and options by their
+    defaults, made with `argument` and `option`, or dataclasses of such fields, of which it gets an
+    instance. With ``--json -`` standard output gets the JSON alone."""
 
     def __init__(self, function: Callable[..., int | None], examples: str) -> None:
         self.function, self.examples = function, examples
@@ -235,7 +271,10 @@ class Command(click.Command):
                 entry.name, entry.type = name, group
                 params.append(parameter_of(entry))
             else:
-                params += [parameter_of(entry, heading_of(group, entry.name)) for entry in options_of(group)]
+                params += [
+                    parameter_of(entry, heading_of(group, entry.name))
+                    for entry in options_of(group)
+                ]
         look = {"help_option_names": ["-h", "--help"]}
         super().__init__(function.__name__, look, params=params, help=getdoc(function))
 
@@ -276,7 +315,12 @@ class Command(click.Command):
 
     def get_help(self, ctx: click.Context) -> str:
         purpose = (self.help or "").split("\n\n")[0]
-        return help_text([(ctx.command_path, self.usage(ctx))], purpose, self.sections(ctx), self.examples.rstrip("\n"))
+        return help_text(
+            [(ctx.command_path, self.usage(ctx))],
+            purpose,
+            self.sections(ctx),
+            self.examples.rstrip("\n"),
+        )
 
     def sections(self, ctx: click.Context) -> dict[str, list[Row]]:
         """What the help lists: terms and what they mean, by heading."""
@@ -294,14 +338,17 @@ def heading_of(group: type, name: str) -> str:
 
 
 def row_of(param: click.Parameter, ctx: click.Context) -> Row:
-    """What a parameter is called in help and messages, with the metavar of its value, and what it is."""
+    """What a parameter is called in help and messages, with the metavar of its value, and what it
+    is."""
     shown = param.get_help_spec(ctx) if isinstance(param, click.Option) else param.make_metavar(ctx)
     return shown, param.help or ""
 
 
-def help_text(usages: Sequence[Row], purpose: str, sections: Mapping[str, Sequence[Row]], examples: str) -> str:
-    """The help of a program or command: how it is run (its name, and the words behind it), its purpose, terms and what
-    they mean by heading, and examples."""
+def help_text(
+    usages: Sequence[Row], purpose: str, sections: Mapping[str, Sequence[Row]], examples: str
+) -> str:
+    """The help of a program or command: how it is run (its name, and the words behind it), its
+    purpose, terms and what they mean by heading, and examples."""
     formatter = click.HelpFormatter(width=HELP_WIDTH)
     for name, words in usages:
         formatter.write_usage(name, words, "usage: ")
@@ -314,24 +361,36 @@ def help_text(usages: Sequence[Row], purpose: str, sections: Mapping[str, Sequen
     return f"{formatter.getvalue()}\nexamples:\n{indent(examples, '  ')}"
 
 
-def command(examples: str, kind: type[Command] = Command) -> Callable[[Callable[..., int | None]], Command]:
-    """Make a `Command` of a function. Its help begins with the first paragraph of the function's docstring and ends
-    with ``examples``. The function returns its exit status, None for 0."""
+def command(
+    examples: str, kind: type[Command] = Command
+) -> Callable[[Callable[..., int | None]], Command]:
+    """Make a `Command` of a function. Its help begins with the first paragraph of the function's
+    docstring and ends with ``examples``. The function returns its exit status, None for 0."""
     return lambda function: kind(function, examples)
 
 
 def flags_of(ctx: click.Context) -> list[str]:
     """Flags of the options of the command that is parsed."""
-    return [flag for param in ctx.command.get_params(ctx) for flag in param.opts if flag.startswith("--")]
+    return [
+        flag
+        for param in ctx.command.get_params(ctx)
+        for flag in param.opts
+        if flag.startswith("--")
+    ]
 
 
 def problem_of(error: click.ClickException) -> str:
     """What is wrong with a command line, as a message of this package."""
     ctx = getattr(error, "ctx", None)
     if isinstance(error, click.NoSuchOption) and ctx is not None:
-        return f"unknown option {printable(error.option_name)!r}; {did_you_mean(error.option_name, flags_of(ctx))}"
+        return (
+            f"unknown option {printable(error.option_name)!r}; "
+            f"{did_you_mean(error.option_name, flags_of(ctx))}"
+        )
     if isinstance(error, click.MissingParameter) and ctx is not None and error.param is not None:
-        _, words, _ = ctx.command.make_parser(ctx).parse_args([*ctx.obj])  # those that no argument takes
+        _, words, _ = ctx.command.make_parser(ctx).parse_args(
+            [*ctx.obj]
+        )  # those that no argument takes
         meant = f"; did you mean {error.param.opts[0]} {printable(words[0])}?" if words else ""
         return " is missing: ".join(row_of(error.param, ctx)) + meant
     return error.format_message()

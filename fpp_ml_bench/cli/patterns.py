@@ -8,7 +8,15 @@ from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command, given, value
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.design.rivals import EpipolarLines
-from fpp_ml_bench.design.search import LEFT_WRONG, Assumptions, Candidate, Design, describe, draw_design, search
+from fpp_ml_bench.design.search import (
+    LEFT_WRONG,
+    Assumptions,
+    Candidate,
+    Design,
+    describe,
+    draw_design,
+    search,
+)
 from fpp_ml_bench.errors import CaptureError, RigError
 from fpp_ml_bench.files import holds, whole_folder, write_atomically, write_files
 from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG, NAMED_RIGS
@@ -41,7 +49,9 @@ def _family(text: str) -> "Crossed":
 
 
 PERIODS = value(
-    "numbers such as 12,14,18 or 12-18", _numbers, lambda found: found != () and all(0 <= one < 1e5 for one in found)
+    "numbers such as 12,14,18 or 12-18",
+    _numbers,
+    lambda found: found != () and all(0 <= one < 1e5 for one in found),
 )
 
 
@@ -51,7 +61,10 @@ class DesignSettings(Assumptions):
 
     HEADING = "design of crossed fringes"
     pitches: tuple[float, ...] | None = option(
-        None, "periods to search, projector px (default: all whole ones that fit the image)", "A,B|A-B", parse=PERIODS
+        None,
+        "periods to search, projector px (default: all whole ones that fit the image)",
+        "A,B|A-B",
+        parse=PERIODS,
     )
     pair: "tuple[Crossed, ...]" = option(
         (),
@@ -60,7 +73,9 @@ class DesignSettings(Assumptions):
         parse=_family,
         many=True,
     )
-    picture: Path | None = option(None, "draw the proposed pair beside the rig's own or 18/18", "FILE.png")
+    picture: Path | None = option(
+        None, "draw the proposed pair beside the rig's own or 18/18", "FILE.png"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +85,14 @@ class PatternSettings(DesignSettings):
     rig: str = argument("rig file (.yaml, .json), or paper or crossed", "RIG")
     out: Path | None = option(
         None,
-        "folder for the images; with --design: write the rig with three frames of the proposed pair (.yaml, .json)",
+        "folder for the images; with --design: write the rig with three frames of the proposed "
+        "pair (.yaml, .json)",
         "DIR|FILE",
     )
     design: bool = option(
         False,
-        "write no images: find two carriers of crossed fringes with the least expected error, and say what they cost",
+        "write no images: find two carriers of crossed fringes with the least expected error, and "
+        "say what they cost",
     )
 
 
@@ -98,15 +115,18 @@ more than half of this distance choose the rival. With finer fringes a phase err
 """
 )
 def patterns(settings: PatternSettings) -> None:
-    """Write the images that a rig's projector shows, in order, and a manifest of what each of them is. Or find the
-    two carriers for crossed fringes of the least expected error, and say what they cost.
+    """Write the images that a rig's projector shows, in order, and a manifest of what each of them
+    is. Or find the two carriers for crossed fringes of the least expected error, and say what they
+    cost.
 
     Raises FppBenchError for an unusable rig file or folder."""
     if settings.design:
         _design(settings)
         return
     if of_design := given(settings, DesignSettings):
-        raise RigError(f"{of_design[0]} belongs to the design of crossed fringes; give --design too")
+        raise RigError(
+            f"{of_design[0]} belongs to the design of crossed fringes; give --design too"
+        )
     if (out := settings.out) is None:
         raise CaptureError("--out DIR is missing: folder for the images")
     named = settings.rig in NAMED_RIGS
@@ -130,11 +150,15 @@ def patterns(settings: PatternSettings) -> None:
             write_files(folder, files, CaptureError)
     size = f"{rig.projector.width} x {rig.projector.height} px"
     print(f"{out}: {len(names)} images of {size}, {first} to {last}, and patterns.json")
-    print("next: project them in this order, one capture each; then fpp-bench decode RIG CAPTURE --out OUT")
+    print(
+        "next: project them in this order, one capture each; then fpp-bench decode RIG CAPTURE "
+        "--out OUT"
+    )
 
 
 def _design(settings: PatternSettings) -> None:
-    """Search, print, and write what is asked for. Raises `RigError` for a rig that can't be used."""
+    """Search, print, and write what is asked for. Raises `RigError` for a rig that can't be
+    used."""
     named = settings.rig in NAMED_RIGS
     rig = NAMED_RIGS[settings.rig]() if named else load_rig(settings.rig)
     found = search(rig, settings, settings.pitches)
@@ -155,25 +179,33 @@ def _design(settings: PatternSettings) -> None:
         print(f"wrote {settings.out}; next: fpp-bench patterns {settings.out} --out DIR")
 
 
-def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tuple[Candidate, str]]) -> None:
+def _print_design(
+    rig: Rig, assumed: Assumptions, found: Design, others: list[tuple[Candidate, str]]
+) -> None:
     (near_mm, far_mm), flat_deg = rig.working_range_mm, EpipolarLines.of(rig).flat_angle_deg
     print(
-        f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees runs along the "
+        f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees "
+        f"runs along the "
         "epipolar lines and tells no depth"
     )
     print(
-        f"phases          a mean error of {assumed.phase_error:g} rad along the line of depths; camera noise of "
-        f"{assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at {near_mm:g} mm; projector blur "
+        f"phases          a mean error of {assumed.phase_error:g} rad along the line of depths; "
+        f"camera noise of "
+        f"{assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at {near_mm:g} mm; "
+        f"projector blur "
         f"{assumed.blur_px:g} px"
     )
     print(
-        f"wrong orders    {100 * assumed.edge_share:g}% of the pixels are near edges and texture, where the phases are "
-        f"off by {assumed.edge_sigma:g} rad across that line; in mm, of the {100 * LEFT_WRONG:g}% that neighbours leave"
+        f"wrong orders    {100 * assumed.edge_share:g}% of the pixels are near edges and texture, "
+        f"where the phases are "
+        f"off by {assumed.edge_sigma:g} rad across that line; in mm, of the {100 * LEFT_WRONG:g}% "
+        f"that neighbours leave"
     )
     for direction in rig.fringe_directions:
         whole_px = rig.periods_in_range(direction) * rig.pitch(direction)
         print(
-            f"one fringe      {direction}: from {whole_px:.1f} px on, the range has one period at most, and the order "
+            f"one fringe      {direction}: from {whole_px:.1f} px on, the range has one period at "
+            f"most, and the order "
             "needs no brightness"
         )
     names = (
@@ -191,7 +223,10 @@ def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tu
     table = Table("", numbers=names, names=3)
     every = max(-(-len(found.searched) // ROWS), 1)
     shown = {id(candidate): candidate for candidate in (*found.searched[::every], found.proposed)}
-    rows = [(candidate, "proposed" if candidate is found.proposed else "") for candidate in shown.values()]
+    rows = [
+        (candidate, "proposed" if candidate is found.proposed else "")
+        for candidate in shown.values()
+    ]
     for candidate, about in sorted(rows, key=lambda row: -row[0].crossed.pitches_px[0]) + others:
         crossed = candidate.crossed
         background = "-" if candidate.background_rad is None else f"{candidate.background_rad:.2f}"
@@ -211,12 +246,17 @@ def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tu
     show(table)
     for candidate, about in others:
         for carrier in candidate.flat:
-            pitch, angle = candidate.crossed.pitches_px[carrier], candidate.crossed.angles_deg[carrier]
+            pitch, angle = (
+                candidate.crossed.pitches_px[carrier],
+                candidate.crossed.angles_deg[carrier],
+            )
             print(f"note: {about}: the carrier of {pitch:g} px at {angle:g} degrees tells no depth")
     crossed = found.proposed.crossed
     print(
-        f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} degrees: the least "
-        f"expected error of {len(found.searched)} periods; a guess of the model, measure it on frames of your scenes"
+        f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} "
+        f"degrees: the least "
+        f"expected error of {len(found.searched)} periods; a guess of the model, measure it on "
+        f"frames of your scenes"
     )
 
 

@@ -1,4 +1,5 @@
-"""``fpp-bench predict`` and ``fpp-bench time``: run a method over a split, and measure what it costs."""
+"""``fpp-bench predict`` and ``fpp-bench time``: run a method over a split, and measure what it
+costs."""
 
 from pathlib import Path
 
@@ -52,7 +53,10 @@ def predict(
     with working_copy(out) as (folder, _), bar as advance:
         seconds = predict_split(opened, method, split, folder, advance)
     frames = "1 frame" if len(method.frames_used) == 1 else f"{len(method.frames_used)} frames"
-    print(f"{out}: {samples} predictions by {method.title}; {frames} and {seconds:.3f} s a sample (median)")
+    print(
+        f"{out}: {samples} predictions by {method.title}; {frames} and {seconds:.3f} s a sample "
+        f"(median)"
+    )
     how = f"{_scoring(method, opened)} --json result.json"
     if isinstance(out, Path):
         print(f"next: fpp-eval {out}{how}")
@@ -62,8 +66,8 @@ def predict(
 
 
 def _scoring(method: Method, opened: "DatasetFolder") -> str:
-    """Options of fpp-eval that make the method's row: a network is scored against the decoded depth that it learnt
-    from, but against that depth the process that made it would score 0."""
+    """Options of fpp-eval that make the method's row: a network is scored against the decoded depth
+    that it learnt from, but against that depth the process that made it would score 0."""
     target = method.target if opened.has_exact else "depth"
     mode = "" if method.mode == "standard" else f" --mode {method.mode}"
     return mode + ("" if target == "depth" else f" --target {target}")
@@ -85,7 +89,9 @@ def time(
     split: str = option("test", "default: test", choices=SPLITS),
     batch: int = option(4, "images a batch (default: 4)", "N", parse=COUNT),
     repeats: int = option(20, "timed runs (default: 20)", "N", parse=COUNT),
-    json: Path | None = option(None, "write the timing here; - is standard output", "FILE", parse=new_file),
+    json: Path | None = option(
+        None, "write the timing here; - is standard output", "FILE", parse=new_file
+    ),
     into: tuple[Path, ...] = option(
         (),
         "put it into this submission.yaml or result file of the same method; may be given again",
@@ -93,7 +99,8 @@ def time(
         many=True,
     ),
 ) -> None:
-    """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."""
+    """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named
+    machine."""
     opened = DatasetFolder(dataset)
     method = chosen.load(opened)
     opened = opened.without_truth()
@@ -116,7 +123,9 @@ def _timing_table(title: str, timing: Timing) -> Table:
         return "unknown" if value is None else f"{value:,.0f} MiB"
 
     (height, width), machine = timing.image_size, timing.hardware
-    table = Table("", show_header=False, title=Text(f"{title}, measured here"), title_justify="left")
+    table = Table(
+        "", show_header=False, title=Text(f"{title}, measured here"), title_justify="left"
+    )
     table.add_column(justify="right", overflow="fold")
     ways = "at once" if timing.batched else "one after another"
     rows = {

@@ -17,15 +17,22 @@ from fpp_ml_bench.options import REQUIRED, argument, option
 
 publish = Program(
     "fpp-bench publish",
-    "Publish a dataset, the leaderboard's page or results on the Hugging Face Hub; sends only what changed.",
+    "Publish a dataset, the leaderboard's page or results on the Hugging Face Hub; sends only what "
+    "changed.",
     {
         "commands": {
             "dataset": (
                 "publish:publish_dataset",
                 "a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes",
             ),
-            "leaderboard": ("publish:publish_leaderboard", "the leaderboard's page as a static Space"),
-            "results": ("publish:publish_results", "results as .eval_results/*.yaml of a model's repository"),
+            "leaderboard": (
+                "publish:publish_leaderboard",
+                "the leaderboard's page as a static Space",
+            ),
+            "results": (
+                "publish:publish_results",
+                "results as .eval_results/*.yaml of a model's repository",
+            ),
         }
     },
     """\
@@ -43,8 +50,12 @@ class Repository:
     """Where to publish, and whether to."""
 
     private = adopt = False
-    repo: str = option(REQUIRED, "repository on the Hub", "OWNER/NAME", parse=hub_client.check_repo_name)
-    dry_run: bool = option(False, "print what would change and send nothing; works without a network, too")
+    repo: str = option(
+        REQUIRED, "repository on the Hub", "OWNER/NAME", parse=hub_client.check_repo_name
+    )
+    dry_run: bool = option(
+        False, "print what would change and send nothing; works without a network, too"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,17 +75,21 @@ fpp-bench publish dataset data/full --repo me/fpp --staging staged    continues 
 def publish_dataset(
     *,
     dataset: Path = argument("folder of the dataset", "DATASET"),
-    license: str | None = option(None, "licence on the card (default: mit; imported data needs one)", "ID"),
+    license: str | None = option(
+        None, "licence on the card (default: mit; imported data needs one)", "ID"
+    ),
     staging: Path | None = option(
         None,
-        "put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
+        "put the files together in DIR and keep them, so that a later run continues (default: a "
+        "temporary folder)",
         "DIR",
     ),
     target: FilledRepository,
 ) -> None:
     """Publish a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes.
 
-    Raises FppBenchError for files that can't be published and for errors of the Hub or the network."""
+    Raises FppBenchError for files that can't be published and for errors of the Hub or the
+    network."""
     hub = hub_client.Hub()
     opened = DatasetFolder(dataset)
     licence = hub_client.dataset_licence(opened, license)
@@ -88,7 +103,8 @@ def publish_dataset(
                 publication = stage(opened, target.repo, folder, texts, usable_cores(), advance)
         except OSError as error:
             raise PublishError(
-                f"can't put the files together in {folder} ({error.strerror or error}); free some space, or give a "
+                f"can't put the files together in {folder} ({error.strerror or error}); free some "
+                f"space, or give a "
                 "folder on another disk with --staging"
             ) from error
         _carry_out(target, hub, publication, remote)
@@ -149,8 +165,11 @@ def publish_results(
         _carry_out(target, hub, publication, remote)
 
 
-def _state(target: Repository, hub: hub_client.Hub, kind: hub_client.Kind, repo: str) -> hub_client.Remote:
-    """The current state of ``repo``; for a dry run that can't ask the Hub, that of one with no files, and a note."""
+def _state(
+    target: Repository, hub: hub_client.Hub, kind: hub_client.Kind, repo: str
+) -> hub_client.Remote:
+    """The current state of ``repo``; for a dry run that can't ask the Hub, that of one with no
+    files, and a note."""
     try:
         return hub.state(kind, repo)
     except hub_client.Unreachable as error:
@@ -161,39 +180,61 @@ def _state(target: Repository, hub: hub_client.Hub, kind: hub_client.Kind, repo:
 
 
 def _remote(target: Repository, hub: hub_client.Hub, kind: hub_client.Kind) -> hub_client.Remote:
-    """The current state of the repository, after checking that token, owner and visibility allow the run."""
+    """The current state of the repository, after checking that token, owner and visibility allow
+    the run."""
     names = set() if target.dry_run else hub.check_token()
     remote = _state(target, hub, kind, target.repo)
     if not remote.exists and kind == "model" and remote.asked:
         raise PublishError(
-            f"{target.repo}: no such model on {hub.endpoint}, or this token may not see it; make it first"
+            f"{target.repo}: no such model on {hub.endpoint}, or this token may not see it; make "
+            f"it first"
         )
     if not remote.exists and not target.dry_run:
         hub.check_may_create(target.repo, names)
     if remote.exists and not remote.private and target.private:
-        raise PublishError(f"{target.repo}: --private was asked for, but this {kind} exists and is public")
+        raise PublishError(
+            f"{target.repo}: --private was asked for, but this {kind} exists and is public"
+        )
     return remote
 
 
 def _carry_out(
-    target: Repository, hub: hub_client.Hub, publication: hub_client.Publication, remote: hub_client.Remote
+    target: Repository,
+    hub: hub_client.Hub,
+    publication: hub_client.Publication,
+    remote: hub_client.Remote,
 ) -> None:
     """Print what changes and send it, unless nothing changes or this is a dry run."""
     hub_client.check_replaceable(publication, remote, target.adopt)
     planned = hub_client.changes(publication, remote)
     visibility = "private" if (remote.private if remote.exists else target.private) else "public"
     url = hub.url(publication.kind, publication.repo)
-    state = f"{'' if remote.exists else 'new, '}{visibility}" if remote.asked else "the Hub was not asked"
+    state = (
+        f"{'' if remote.exists else 'new, '}{visibility}"
+        if remote.asked
+        else "the Hub was not asked"
+    )
     print(f"{publication.kind} {url} ({state})")
     for change in planned:
         size = gigabytes(change.bytes)
-        print(f"  {_SIGNS[change.status]} {change.status:<9}  {size:>9}  {printable(change.path, 300)}")
-    bytes_of = {status: [change.bytes for change in planned if change.status == status] for status in _SIGNS}
-    counts = [f"{len(sizes)} {status} ({gigabytes(sum(sizes))})" for status, sizes in bytes_of.items() if sizes]
+        print(
+            f"  {_SIGNS[change.status]} {change.status:<9}  {size:>9}  "
+            f"{printable(change.path, 300)}"
+        )
+    bytes_of = {
+        status: [change.bytes for change in planned if change.status == status] for status in _SIGNS
+    }
+    counts = [
+        f"{len(sizes)} {status} ({gigabytes(sum(sizes))})"
+        for status, sizes in bytes_of.items()
+        if sizes
+    ]
     print(f"{len(planned)} files: {', '.join(counts)}")
     nothing = all(change.status == "unchanged" for change in planned)
     if nothing or target.dry_run:
-        print("Nothing to send: the Hub has all files." if nothing else "Dry run: nothing was sent.")
+        print(
+            "Nothing to send: the Hub has all files." if nothing else "Dry run: nothing was sent."
+        )
         if not remote.asked:
             print("The Hub was not asked which files it has, so all files are listed as new.")
         return

@@ -1,5 +1,6 @@
-"""``fpp-bench tradeoff``: error against run time, frames and memory, and how the time grows. ``fpp-bench stability``:
-ill-conditioned and extreme cases against higher precision and theoretical bounds."""
+"""``fpp-bench tradeoff``: error against run time, frames and memory, and how the time grows.
+``fpp-bench stability``: ill-conditioned and extreme cases against higher precision and theoretical
+bounds."""
 
 from itertools import groupby
 from pathlib import Path
@@ -37,13 +38,16 @@ def measure(
     ),
     method: tuple[str, ...] = option(
         (),
-        "measure only this method: a name, file.py:Class, or weights; may be repeated. What the folder holds of others "
+        "measure only this method: a name, file.py:Class, or weights; may be repeated. What the "
+        "folder holds of others "
         "stays (default: every method, and the shipped networks of the image's size)",
         "METHOD",
         parse=str,
         many=True,
     ),
-    views: int | None = option(None, "views of each test object (default: 2, quick: 1)", "N", parse=whole(1, 1000)),
+    views: int | None = option(
+        None, "views of each test object (default: 2, quick: 1)", "N", parse=whole(1, 1000)
+    ),
     quick: bool = option(False, "one view of each test object"),
     listed: bool = option(False, "show what would be measured, and stop", flag="--list"),
     threads: int = option(1, "threads a method may use (default: 1)", "N", parse=whole(1, 1000)),
@@ -52,7 +56,8 @@ def measure(
         "processor: processor time of this process, for a shared machine (default: wall)",
     ),
 ) -> None:
-    """Error against run time, frames and memory for every method on this machine, and how the time grows.
+    """Error against run time, frames and memory for every method on this machine, and how the time
+    grows.
 
     Measures what is missing, writes all files, prints both tables and remarks."""
     plan = planned(dataset, out, method, views or (1 if quick else 2), threads, clock)
@@ -88,14 +93,20 @@ def check(
         choices=tuple(GROUPS),
         many=True,
     ),
-    out: Path | None = option(None, "write stability.json and stability.png here", "DIR", parse=new_folder),
+    out: Path | None = option(
+        None, "write stability.json and stability.png here", "DIR", parse=new_folder
+    ),
     json: Path | None = option(
-        None, "write the run as JSON; - is standard output, without the table", "FILE", parse=new_file
+        None,
+        "write the run as JSON; - is standard output, without the table",
+        "FILE",
+        parse=new_file,
     ),
     quick: bool = option(False, "leave out the case that needs gigabytes (10 million triangles)"),
     listed: bool = option(False, "list the cases and their bounds, and run none", flag="--list"),
 ) -> int:
-    """Check ill-conditioned and extreme cases against references of higher precision and theoretical bounds.
+    """Check ill-conditioned and extreme cases against references of higher precision and
+    theoretical bounds.
 
     The status is 1 if any FAILs."""
     groups = [name for name in GROUPS if name in group]
@@ -103,7 +114,12 @@ def check(
     if listed:
         for (name, family), members in groupby(cases, lambda case: (case.group, case.family)):
             case, *others = members
-            show(Text(f"{name}: {family} ({1 + len(others)}): {case.computes}; against {case.reference}"))
+            show(
+                Text(
+                    f"{name}: {family} ({1 + len(others)}): {case.computes}; against "
+                    f"{case.reference}"
+                )
+            )
             show(Text(f"    bound: {case.predicts}"))
         show(Text(f"{len(cases)} cases"))
         return OK
@@ -116,7 +132,9 @@ def check(
     table = Table("group", numbers=numbers, elsewhere="--json FILE")
     for name, part in summary(rows).items():
         *counts, ratio, cpu_s = part.values()
-        table.add_row(name, *map(str, counts), "-" if ratio is None else f"{ratio:.2g}", f"{cpu_s:.1f}")
+        table.add_row(
+            name, *map(str, counts), "-" if ratio is None else f"{ratio:.2g}", f"{cpu_s:.1f}"
+        )
     failed = [row for row in rows if row.verdict == "FAIL"]
     show(table, *(Text(f"FAIL {row.case.group}: {row.case.name}: {row.against}") for row in failed))
     for path in written:

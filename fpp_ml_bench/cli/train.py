@@ -1,5 +1,5 @@
-"""``fpp-bench train``: one recipe, one weights file; and ``fpp-bench reproduce``: the paper's tables and its further
-directions, trained and scored here."""
+"""``fpp-bench train``: one recipe, one weights file; and ``fpp-bench reproduce``: the paper's
+tables and its further directions, trained and scored here."""
 
 import re
 import sys
@@ -45,19 +45,26 @@ fpp-bench predict runs/mine/weights.safetensors data/small224 --out predictions
 def train(
     *,
     recipe: str = argument(
-        "a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or one of the methods below", "RECIPE"
+        "a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or one of the methods below",
+        "RECIPE",
     ),
     dataset: Path | None = argument(
         "dataset folder, of the preset's image size (those methods: none)", "DATASET", None
     ),
     out: Path = option(REQUIRED, "new folder, or that of a training to resume", "DIR"),
-    preset: str = option(PRESETS[0], f"what a shipped recipe is scaled to (default: {PRESETS[0]})", choices=PRESETS),
+    preset: str = option(
+        PRESETS[0], f"what a shipped recipe is scaled to (default: {PRESETS[0]})", choices=PRESETS
+    ),
     minutes: float | None = option(
-        None, "stop before an epoch that would not finish in time, everything saved", "M", parse=MINUTES
+        None,
+        "stop before an epoch that would not finish in time, everything saved",
+        "M",
+        parse=MINUTES,
     ),
     options: dict[str, Any],
 ) -> int:
-    """Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes.
+    """Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict
+    takes.
 
     Raises FppBenchError where that can't be done."""
     from fpp_ml_bench.baselines.training.depth_training import train as train_recipe
@@ -67,9 +74,13 @@ def train(
         method = registry.find(recipe).method
         if method.Training is None:
             learned = ", ".join(name for name, other in methods.items() if other.Training)
-            raise RecipeError(f"{recipe}: there is nothing to train; methods with a training: {learned}")
+            raise RecipeError(
+                f"{recipe}: there is nothing to train; methods with a training: {learned}"
+            )
         if dataset is not None:
-            raise RecipeError(f"{dataset}: {recipe} renders what it learns from, and takes none; leave it out")
+            raise RecipeError(
+                f"{dataset}: {recipe} renders what it learns from, and takes none; leave it out"
+            )
         import cv2
 
         cv2.setNumThreads(1)
@@ -86,7 +97,10 @@ def train(
     if not PartialState().is_main_process:
         return OK if trained.finished else CHECK_FAILED
     if not trained.finished:
-        print(f"{out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
+        print(
+            f"{out}: stopped after {trained.epochs} epochs, everything saved; run the same command "
+            f"to resume"
+        )
         return CHECK_FAILED
     epochs = f"epoch {trained.best_epoch} of {trained.epochs}"
     print(f"{trained.weights}: {resolved.title}, {epochs}, {trained.seconds:.0f} s")
@@ -115,36 +129,49 @@ fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings,
 )
 def reproduce_tables(
     *,
-    table: str | None = argument(f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1", "TABLE", None),
+    table: str | None = argument(
+        f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1", "TABLE", None
+    ),
     dataset: Path | None = argument(
         "dataset, built when missing (default: data/small224 or data/full)", "DATASET", None
     ),
     preset: str = option(
         PRESETS[0],
-        "small: 224 px, narrow networks, 48 epochs (default); paper: 960 px and full width, needs a GPU",
+        "small: 224 px, narrow networks, 48 epochs (default); paper: 960 px and full width, needs "
+        "a GPU",
         choices=PRESETS,
     ),
-    out: Path = option(Path("runs"), "trainings, predictions and tables go below DIR/PRESET (default: runs)", "DIR"),
+    out: Path = option(
+        Path("runs"), "trainings, predictions and tables go below DIR/PRESET (default: runs)", "DIR"
+    ),
     rows: Path | None = option(None, "leaderboard rows (default: OUT/PRESET/rows)", "DIR"),
     only_missing: bool = option(
         False,
-        "keep rows that are up to date with the dataset and the recipe, and train nothing for them; without it, all "
+        "keep rows that are up to date with the dataset and the recipe, and train nothing for "
+        "them; without it, all "
         "rows are made again. Finished trainings are always kept",
     ),
-    from_scratch: bool = option(False, "train even where weights come with the package", flag="--train"),
+    from_scratch: bool = option(
+        False, "train even where weights come with the package", flag="--train"
+    ),
     folds: int | None = option(
         None,
-        "cross-validate instead: train each row of TABLE (default: RMSE, hybrid L1 0.7 and ResUNet) N times, each "
+        "cross-validate instead: train each row of TABLE (default: RMSE, hybrid L1 0.7 and "
+        "ResUNet) N times, each "
         "without a part of all objects, and score it on that part",
         "N",
         parse=PARTS,
     ),
     workers: int | None = option(
-        None, "trainings beside each other, one core each (default: all cores; 1 with a GPU)", "N", parse=AT_LEAST_ONE
+        None,
+        "trainings beside each other, one core each (default: all cores; 1 with a GPU)",
+        "N",
+        parse=AT_LEAST_ONE,
     ),
     minutes: float | None = option(
         None,
-        "stop trainings before an epoch that would exceed M minutes, everything saved, and score what is at its end "
+        "stop trainings before an epoch that would exceed M minutes, everything saved, and score "
+        "what is at its end "
         "(exit status 1); the same command continues",
         "M",
         parse=MINUTES,
@@ -152,7 +179,8 @@ def reproduce_tables(
     anyway: bool = option(False, "train preset paper even without a GPU"),
     listed: bool = option(False, "show rows, recipes and their state, and stop", flag="--list"),
 ) -> int:
-    """Train, predict, time and score the rows of the paper's tables, and show them beside its numbers.
+    """Train, predict, time and score the rows of the paper's tables, and show them beside its
+    numbers.
 
     Does what is missing. Raises FppBenchError where a step can't be done or a training failed."""
     from fpp_ml_bench.baselines.reproduce.work import ReproduceSettings
@@ -163,12 +191,16 @@ def reproduce_tables(
     name, slash, row = (table or ALL).partition("/")
     tables = TABLES if name == ALL else (name,)
     if slash and row not in table_rows(name):
-        raise RecipeError(f"{name} has no row {printable(row)!r}; {did_you_mean(row, table_rows(name))}")
+        raise RecipeError(
+            f"{name} has no row {printable(row)!r}; {did_you_mean(row, table_rows(name))}"
+        )
     if listed:
         _list(tables, folders)
         return OK
     if table is None and folds is None:
-        raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
+        raise RecipeError(
+            f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows"
+        )
     import torch  # which --help and --list do without
 
     from fpp_ml_bench.leaderboard import reproduced
@@ -209,9 +241,14 @@ def reproduce_tables(
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
-        raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
+        raise TrainingError(
+            f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}"
+        )
     if outcome.stopped is not None:
-        print(f"Stopped after {minutes:g} minutes; the first that is not at its end: {outcome.stopped}.")
+        print(
+            f"Stopped after {minutes:g} minutes; the first that is not at its end: "
+            f"{outcome.stopped}."
+        )
         print(f"Continue with: {again}")
         return CHECK_FAILED
     return OK
@@ -220,7 +257,9 @@ def reproduce_tables(
 def _list(tables: tuple[str, ...], folders: "Folders") -> None:
     from fpp_ml_bench.baselines.reproduce.work import state_of
 
-    jobs = planned([f"{table}/{row}" for table in tables for row in table_rows(table)], folders.preset)
+    jobs = planned(
+        [f"{table}/{row}" for table in tables for row in table_rows(table)], folders.preset
+    )
     titles = "Row", "Training", "State", "Row written", "Published: object MAE"
     first_out = "Row written", "Published: object MAE", "Training"
     table = Table(*titles, first_out=first_out, title=f"preset {folders.preset}, {folders.runs}")
@@ -234,13 +273,17 @@ def _list(tables: tuple[str, ...], folders: "Folders") -> None:
         table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or "-")
     show(table)
     rows = len({row for job in jobs for row in job.rows})
-    print(f"{len(jobs)} trainings fill {rows} rows; the rows of {len(jobs) - empty} trainings come with the package.")
+    print(
+        f"{len(jobs)} trainings fill {rows} rows; the rows of {len(jobs) - empty} trainings come "
+        f"with the package."
+    )
     if empty:
         print(f"Those of the other {empty} are not measured yet: {EMPTY_BECAUSE[folders.preset]}.")
 
 
 def _published(path: Path) -> str | None:
-    """The error of the row that comes with the package, with the version of its benchmark; None where there is none."""
+    """The error of the row that comes with the package, with the version of its benchmark; None
+    where there is none."""
     if not path.is_file():
         return None
     row = read_entry(path).row

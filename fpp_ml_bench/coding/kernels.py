@@ -1,8 +1,8 @@
 """Compiled kernels of the codes: phase, cell and order of a block of pixels, fused.
 
-They are imported where they are called, since numba takes longer to import than most commands take. Pixels are
-processed in tiles that stay in the first-level cache, frame by frame and without branches, so that the compiler can use
-vector instructions.
+They are imported where they are called, since numba takes longer to import than most commands take.
+Pixels are processed in tiles that stay in the first-level cache, frame by frame and without
+branches, so that the compiler can use vector instructions.
 """
 
 import math
@@ -28,14 +28,15 @@ BOTTOM = (
     2.485846490142306297962e1,
     1.0,
 )
-"""Cephes (Moshier 1989): atan(t) = t + t z P(z) / Q(z) with z = t^2 on [0, tan(pi/8)], lowest coefficient first."""
+"""Cephes (Moshier 1989): atan(t) = t + t z P(z) / Q(z) with z = t^2 on [0, tan(pi/8)], lowest
+coefficient first."""
 TAN_EIGHTH = math.sqrt(2.0) - 1.0
 
 
 @njit
 def _minus_atan2(y, x):  # type: ignore[no-untyped-def]
-    """-atan2(y, x) in [-pi, pi) to 2 ulp, with the same bits on every processor; without calls, which would stop
-    vectorisation."""
+    """-atan2(y, x) in [-pi, pi) to 2 ulp, with the same bits on every processor; without calls,
+    which would stop vectorisation."""
     ax, ay = abs(x), abs(y)
     small, large = min(ax, ay), max(ax, ay)
     upper = small > TAN_EIGHTH * large
@@ -65,17 +66,26 @@ def minus_atan2_all(sine, cosine, phase):  # type: ignore[no-untyped-def]
 def decode_block(frames, weights, code, limits, codes, results):  # type: ignore[no-untyped-def]
     """A direction of a block of n pixels: phase, cell, order and projector coordinate.
 
-    ``frames`` uint8 (N + bits, n): sinusoids, then Gray bits; ``weights`` (3, N); ``code`` = number of Gray bits, cell
-    centres in rad, pitch and length in px; ``limits`` = least modulation, most clipped steps, ambiguous fraction,
-    inconsistent rad; ``codes`` = low modulation, saturated, inconsistent, outside; ``results`` = coordinate px,
-    modulation and phase (float64) and reason (uint8, 0 = decoded), each (n,)."""
+    ``frames`` uint8 (N + bits, n): sinusoids, then Gray bits; ``weights`` (3, N); ``code`` = number
+    of Gray bits, cell centres in rad, pitch and length in px; ``limits`` = least modulation, most
+    clipped steps, ambiguous fraction, inconsistent rad; ``codes`` = low modulation, saturated,
+    inconsistent, outside; ``results`` = coordinate px, modulation and phase (float64) and reason
+    (uint8, 0 = decoded), each (n,)."""
     bits, centres, pitch, length = code
     coordinate, modulation, phase, reason = results
     steps, total = weights.shape[1], frames.shape[1]
     mean, cosine, sine = np.empty(TILE), np.empty(TILE), np.empty(TILE)
     clipped, centre, faulty = np.empty(TILE, np.int32), np.empty(TILE), np.empty(TILE)
-    dark, bright, threshold = np.empty(TILE, np.int16), np.empty(TILE, np.int16), np.empty(TILE, np.int16)
-    cell, doubt, previous = np.empty(TILE, np.int16), np.empty(TILE, np.int16), np.empty(TILE, np.int16)
+    dark, bright, threshold = (
+        np.empty(TILE, np.int16),
+        np.empty(TILE, np.int16),
+        np.empty(TILE, np.int16),
+    )
+    cell, doubt, previous = (
+        np.empty(TILE, np.int16),
+        np.empty(TILE, np.int16),
+        np.empty(TILE, np.int16),
+    )
     cells = len(centres)
     for start in range(0, total, TILE):
         n = min(TILE, total - start)
@@ -98,8 +108,9 @@ def decode_block(frames, weights, code, limits, codes, results):  # type: ignore
             b = math.sqrt(cosine[i] * cosine[i] + sine[i] * sine[i])
             modulation[start + i] = b
             margin = limits[2] * b
-            # Grey levels are whole numbers, so the float comparisons become exact integer comparisons: grey > mean is
-            # grey > floor(mean), and mean - margin < grey < mean + margin is dark < grey < bright.
+            # Grey levels are whole numbers, so the float comparisons become exact integer
+            # comparisons: grey > mean is grey > floor(mean), and mean - margin < grey < mean +
+            # margin is dark < grey < bright.
             threshold[i] = np.int16(math.floor(mean[i]))
             dark[i] = np.int16(max(math.floor(mean[i] - margin), -1.0))
             bright[i] = np.int16(min(math.ceil(mean[i] + margin), 256.0))

@@ -1,12 +1,15 @@
-"""Rivals of the true order: other depths at which two wrapped phases are nearly the same, along a rig's epipolar lines.
+"""Rivals of the true order: other depths at which two wrapped phases are nearly the same, along a
+rig's epipolar lines.
 
-As depth goes through the working range, a pixel's ray runs on a straight line of the pattern, and along it every
-carrier's phase grows evenly. So a rig is, for its orders, no more than the vector from the near to the far end of that
-line, for a grid of pixels, and the place of the background on it (`EpipolarLines`).
+As depth goes through the working range, a pixel's ray runs on a straight line of the pattern, and
+along it every carrier's phase grows evenly. So a rig is, for its orders, no more than the vector
+from the near to the far end of that line, for a grid of pixels, and the place of the background on
+it (`EpipolarLines`).
 
-Over the range a pixel's pair of phases runs along a line on the torus and winds around it. A rival is another turn of
-that line. Unwrapped, the pair grows from 0 to ``turns`` (two numbers), and the rivals of a depth are the points (m, n)
-of the whole numbers but (0, 0), as near as the line comes to them.
+Over the range a pixel's pair of phases runs along a line on the torus and winds around it. A rival
+is another turn of that line. Unwrapped, the pair grows from 0 to ``turns`` (two numbers), and the
+rivals of a depth are the points (m, n) of the whole numbers but (0, 0), as near as the line comes
+to them.
 """
 
 import math
@@ -29,11 +32,13 @@ _TINY = float(np.finfo(np.float64).tiny)
 
 @dataclass(frozen=True)
 class EpipolarLines:
-    """The lines of n pixels, in projector px (u, v); those of pixels that see the same are kept once.
+    """The lines of n pixels, in projector px (u, v); those of pixels that see the same are kept
+    once.
 
-    ``across_px`` float64 (n, 2): from the near to the far end of the range. ``far_px_per_mm`` (n, 2): the change with
-    depth at the far end. ``background`` (n,): the place of the background plane on the line, 0 at the near end and 1 at
-    the far end, so above 1; None where no background is known. ``range_mm``: the depths of both ends.
+    ``across_px`` float64 (n, 2): from the near to the far end of the range. ``far_px_per_mm`` (n,
+    2): the change with depth at the far end. ``background`` (n,): the place of the background plane
+    on the line, 0 at the near end and 1 at the far end, so above 1; None where no background is
+    known. ``range_mm``: the depths of both ends.
     """
 
     across_px: NDArray[np.float64]
@@ -43,22 +48,32 @@ class EpipolarLines:
 
     @classmethod
     def of(cls, rig: Rig) -> "EpipolarLines":
-        """The lines of a grid of pixels that see the pattern at the standoff; a lens that bends them is taken as
-        straight between their ends. Raises `RigError` where no pixel sees it over the whole range."""
+        """The lines of a grid of pixels that see the pattern at the standoff; a lens that bends
+        them is taken as straight between their ends. Raises `RigError` where no pixel sees it over
+        the whole range."""
         width, height = rig.camera.width, rig.camera.height
         columns, rows = (np.linspace(0, size - 1, GRID) for size in (width, height))
-        u, v = np.append(np.tile(columns, GRID), (width - 1) / 2), np.append(np.repeat(rows, GRID), (height - 1) / 2)
+        u, v = (
+            np.append(np.tile(columns, GRID), (width - 1) / 2),
+            np.append(np.repeat(rows, GRID), (height - 1) / 2),
+        )
         x, y = rig.camera.normalised(u, v)
         rays = np.column_stack([x, y, np.ones_like(x)])
         near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
         depths = [near_m, far_m, rig.standoff_m, far_m - _STEP_M, far_m + _STEP_M]
         depths += [] if rig.background_m is None else [rig.background_m]
-        near, far, middle, before, behind, *beyond = (np.stack(rig.project(rays * depth), axis=1) for depth in depths)
+        near, far, middle, before, behind, *beyond = (
+            np.stack(rig.project(rays * depth), axis=1) for depth in depths
+        )
         seen = np.isfinite(near).all(axis=1) & np.isfinite(far).all(axis=1)
-        inside = (middle >= -0.5) & (middle <= np.array([rig.projector.width, rig.projector.height]) - 0.5)
+        inside = (middle >= -0.5) & (
+            middle <= np.array([rig.projector.width, rig.projector.height]) - 0.5
+        )
         seen &= inside.all(axis=1)
         if not seen.any():
-            raise RigError("no pixel sees the pattern over the whole working range: check pose and range")
+            raise RigError(
+                "no pixel sees the pattern over the whole working range: check pose and range"
+            )
         across, slope = (far - near)[seen], ((behind - before) / (2 * _STEP_M * MM_PER_M))[seen]
         parts = [across, slope]
         if beyond:
@@ -70,7 +85,8 @@ class EpipolarLines:
 
     @property
     def flat_angle_deg(self) -> float:
-        """The angle of a carrier that runs along the line and tells no depth, -90 to 90 degrees: of the longest."""
+        """The angle of a carrier that runs along the line and tells no depth, -90 to 90 degrees: of
+        the longest."""
         u_px, v_px = self.across_px[np.argmax((self.across_px**2).sum(axis=1))]
         return float(np.degrees(np.arctan2(-v_px, u_px) if u_px > 0 else np.arctan2(v_px, -u_px)))
 
@@ -79,8 +95,9 @@ class EpipolarLines:
         return self.across_px @ np.array(crossed.cycles_per_px).T
 
     def places(self, depth_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Places of depths (n,) on a line, 0 at the near and 1 at the far end: even in 1 / depth, as they are where the
-        baseline is square to the projector's axis, and nearly so elsewhere."""
+        """Places of depths (n,) on a line, 0 at the near and 1 at the far end: even in 1 / depth,
+        as they are where the baseline is square to the projector's axis, and nearly so
+        elsewhere."""
         near_mm, far_mm = self.range_mm
         return (1 / near_mm - 1 / depth_mm) / (1 / near_mm - 1 / far_mm)
 
@@ -91,11 +108,14 @@ class EpipolarLines:
 
 
 def nearest(
-    turns: NDArray[np.float64], low: NDArray[np.float64] | float, high: NDArray[np.float64] | float, own: bool = False
+    turns: NDArray[np.float64],
+    low: NDArray[np.float64] | float,
+    high: NDArray[np.float64] | float,
+    own: bool = False,
 ) -> NDArray[np.float64]:
-    """Distance in rad from the line ``turns`` x place, place from ``low`` to ``high``, to the nearest whole numbers
-    (m, n); with ``own`` (0, 0) counts too. ``turns`` float64 (..., 2), ``low`` and ``high`` that broadcast to (...);
-    returns (...)."""
+    """Distance in rad from the line ``turns`` x place, place from ``low`` to ``high``, to the
+    nearest whole numbers (m, n); with ``own`` (0, 0) counts too. ``turns`` float64 (..., 2),
+    ``low`` and ``high`` that broadcast to (...); returns (...)."""
     least = np.full(np.broadcast_shapes(turns.shape[:-1], np.shape(low), np.shape(high)), np.inf)
     for distance, _ in _distances(turns, low, high, own):
         np.minimum(least, distance, out=least)
@@ -103,16 +123,26 @@ def nearest(
 
 
 def _distances(
-    turns: NDArray[np.float64], low: NDArray[np.float64] | float, high: NDArray[np.float64] | float, own: bool
+    turns: NDArray[np.float64],
+    low: NDArray[np.float64] | float,
+    high: NDArray[np.float64] | float,
+    own: bool,
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Distances in rad from the line, as in `nearest`, to the whole numbers beside it: along the axis that grows
-    faster all that the line passes, and across the three next to it; and the places on the line that are nearest."""
+    """Distances in rad from the line, as in `nearest`, to the whole numbers beside it: along the
+    axis that grows faster all that the line passes, and across the three next to it; and the places
+    on the line that are nearest."""
     steep = np.abs(turns[..., 1]) > np.abs(turns[..., 0])
-    fast, slow = np.where(steep, turns[..., 1], turns[..., 0]), np.where(steep, turns[..., 0], turns[..., 1])
+    fast, slow = (
+        np.where(steep, turns[..., 1], turns[..., 0]),
+        np.where(steep, turns[..., 0], turns[..., 1]),
+    )
     fast, slow = np.abs(fast), np.where(fast < 0, -slow, slow)  # (m, n) and (-m, -n) are alike
     fast = np.maximum(fast, _TINY)
     square, slope, most = fast * fast + slow * slow, slow / fast, float(fast.max())
-    start, stop = math.floor(min(float(np.min(low)), 0.0) * most), math.ceil(float(np.max(high)) * most)
+    start, stop = (
+        math.floor(min(float(np.min(low)), 0.0) * most),
+        math.ceil(float(np.max(high)) * most),
+    )
     for m in range(start - 1, stop + 2):
         middle = np.rint(m * slope)
         for n in (middle - 1, middle, middle + 1):
@@ -122,14 +152,16 @@ def _distances(
 
 
 def rival_distance(turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance in rad of the nearest rival of any depth in the range, for ``turns`` (..., 2): what an error of the two
-    phases must cross half of to choose a wrong order."""
+    """Distance in rad of the nearest rival of any depth in the range, for ``turns`` (..., 2): what
+    an error of the two phases must cross half of to choose a wrong order."""
     return nearest(turns, 0.0, 1.0)
 
 
-def background_distance(turns: NDArray[np.float64], background: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance in rad of the background's phases from those of every depth in the range; ``background``: its place on
-    the line (`EpipolarLines`), which broadcasts to (...)."""
+def background_distance(
+    turns: NDArray[np.float64], background: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distance in rad of the background's phases from those of every depth in the range;
+    ``background``: its place on the line (`EpipolarLines`), which broadcasts to (...)."""
     return nearest(turns, background - 1.0, background, own=True)
 
 
@@ -140,14 +172,14 @@ def wrong_orders(
     share: float = 1.0,
     surfaces: tuple[float, float] = (0.0, 1.0),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Expected share of pixels with a wrong order, for ``turns`` (..., 2) on ``lines``, where no neighbour helps, and
-    the error in mm that they add to the mean: means over depths at ``surfaces`` of the range (places on the line,
-    evenly) and sums over rivals.
+    """Expected share of pixels with a wrong order, for ``turns`` (..., 2) on ``lines``, where no
+    neighbour helps, and the error in mm that they add to the mean: means over depths at
+    ``surfaces`` of the range (places on the line, evenly) and sums over rivals.
 
-    Errors of a single frame's phase are mostly edges, texture and the other carrier, with heavy tails: across the line
-    a ``share`` of the pixels has two-sided exponential ones with a standard deviation of ``sigma`` rad, (...) or one
-    for all. A rival at distance d is chosen with the probability of an error above d / 2, ``share exp(-sqrt(2) d / (2
-    sigma)) / 2``.
+    Errors of a single frame's phase are mostly edges, texture and the other carrier, with heavy
+    tails: across the line a ``share`` of the pixels has two-sided exponential ones with a standard
+    deviation of ``sigma`` rad, (...) or one for all. A rival at distance d is chosen with the
+    probability of an error above d / 2, ``share exp(-sqrt(2) d / (2 sigma)) / 2``.
     """
     places = np.linspace(*surfaces, 41)
     true_mm = lines.depths_mm(places)

@@ -1,5 +1,6 @@
-"""The search for two carriers: pairs of every period within limits, what each costs, and the one to take; and a picture
-of it: the lines on the torus, the rival distance over depth, and the expected error over the period."""
+"""The search for two carriers: pairs of every period within limits, what each costs, and the one to
+take; and a picture of it: the lines on the torus, the rival distance over depth, and the expected
+error over the period."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 FLAT_TURNS = 0.05
 """A carrier that turns less over the whole range tells no depth."""
 LEFT_WRONG = 0.2
-"""Of the wrong orders of single pixels, those that neighbours leave: measured 0.1 to 0.4 (docs/results/crossed.md)."""
+"""Of the wrong orders of single pixels, those that neighbours leave: measured 0.1 to 0.4
+(docs/results/crossed.md)."""
 _PLACES = np.linspace(0.0, 1.0, 400)
 
 
@@ -44,21 +46,27 @@ def _pair(text: str) -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Assumptions:
-    """What the figures of a pair rest on. Raises `RigError` for numbers that are not above 0 and finite.
+    """What the figures of a pair rest on. Raises `RigError` for numbers that are not above 0 and
+    finite.
 
-    ``image_px``: shortest and longest period in the image. ``surfaces_mm``: where surfaces are expected, None for
-    anywhere in the range; a rival may be anywhere in it. ``phase_error``: mean error in rad, along the line of depths,
-    of the two phases of a window; ``edge_share`` and ``edge_sigma``: share of the pixels near edges and texture, and
-    the standard deviation in rad of their errors across the line, which decide orders. These three are those of the
-    validation objects in the lights `paper` and `workshop`, for periods of 5 to 31 image px on three rigs: in rad they
-    hardly depend on the period (docs/results/crossed.md). ``blur_px``: sigma of the projector's blur, projector px,
-    which takes modulation from fine periods. ``noise_grey``: the camera's noise, with ``white_grey``, the grey level of
-    white at the near end (falling with the square of the distance).
+    ``image_px``: shortest and longest period in the image. ``surfaces_mm``: where surfaces are
+    expected, None for anywhere in the range; a rival may be anywhere in it. ``phase_error``: mean
+    error in rad, along the line of depths, of the two phases of a window; ``edge_share`` and
+    ``edge_sigma``: share of the pixels near edges and texture, and the standard deviation in rad of
+    their errors across the line, which decide orders. These three are those of the validation
+    objects in the lights `paper` and `workshop`, for periods of 5 to 31 image px on three rigs: in
+    rad they hardly depend on the period (docs/results/crossed.md). ``blur_px``: sigma of the
+    projector's blur, projector px, which takes modulation from fine periods. ``noise_grey``: the
+    camera's noise, with ``white_grey``, the grey level of white at the near end (falling with the
+    square of the distance).
     """
 
     HEADING = "design of crossed fringes"
     image_px: tuple[float, float] = option(
-        (6.0, 40.0), "limits of a period in the image, px (default: 6,40)", "LEAST,MOST", parse=_pair
+        (6.0, 40.0),
+        "limits of a period in the image, px (default: 6,40)",
+        "LEAST,MOST",
+        parse=_pair,
     )
     surfaces_mm: tuple[float, float] | None = option(
         None,
@@ -67,14 +75,27 @@ class Assumptions:
         flag="--surfaces",
         parse=_pair,
     )
-    phase_error: float = option(0.12, "mean error of the phases along the line of depths (default: 0.12)", "RAD")
-    edge_share: float = option(0.35, "share of the pixels near edges and texture (default: 0.35)", "SHARE")
-    edge_sigma: float = option(0.2, "error of their phases across that line, for orders (default: 0.2)", "RAD")
-    blur_px: float = option(0.5, "sigma of the projector's blur, projector px (default: 0.5)", "PX", flag="--blur")
-    noise_grey: float = option(
-        1.0, "camera noise, grey levels of 255, for the phase error (default: 1)", "GREY", flag="--noise"
+    phase_error: float = option(
+        0.12, "mean error of the phases along the line of depths (default: 0.12)", "RAD"
     )
-    white_grey: float = option(180.0, "grey level of white at the near end (default: 180)", "GREY", flag="--white")
+    edge_share: float = option(
+        0.35, "share of the pixels near edges and texture (default: 0.35)", "SHARE"
+    )
+    edge_sigma: float = option(
+        0.2, "error of their phases across that line, for orders (default: 0.2)", "RAD"
+    )
+    blur_px: float = option(
+        0.5, "sigma of the projector's blur, projector px (default: 0.5)", "PX", flag="--blur"
+    )
+    noise_grey: float = option(
+        1.0,
+        "camera noise, grey levels of 255, for the phase error (default: 1)",
+        "GREY",
+        flag="--noise",
+    )
+    white_grey: float = option(
+        180.0, "grey level of white at the near end (default: 180)", "GREY", flag="--white"
+    )
 
     def __post_init__(self) -> None:
         for entry in options_of(Assumptions):
@@ -90,10 +111,11 @@ class Assumptions:
 class Candidate:
     """Two carriers and what is expected of them.
 
-    ``rival_rad``: distance of the nearest rival order. ``background_rad``: of the background plane, None where none is
-    known. ``phase_mm``: mean error of a depth of the right order. ``wrong_share``: expected share of wrong orders
-    before neighbours help, and ``wrong_mm``: what those that are left after them add to the mean error. ``image_px``:
-    periods in the image. ``turns``: periods that the carriers cross over the range, the most of any pixel.
+    ``rival_rad``: distance of the nearest rival order. ``background_rad``: of the background plane,
+    None where none is known. ``phase_mm``: mean error of a depth of the right order.
+    ``wrong_share``: expected share of wrong orders before neighbours help, and ``wrong_mm``: what
+    those that are left after them add to the mean error. ``image_px``: periods in the image.
+    ``turns``: periods that the carriers cross over the range, the most of any pixel.
     """
 
     crossed: Crossed
@@ -117,48 +139,62 @@ class Candidate:
 
 
 class Design(NamedTuple):
-    """The outcome of a search: the pairs that were ``searched``, the finest first, and the one of them ``proposed``,
-    that of the least expected error."""
+    """The outcome of a search: the pairs that were ``searched``, the finest first, and the one of
+    them ``proposed``, that of the least expected error."""
 
     proposed: Candidate
     searched: tuple[Candidate, ...]
 
 
 def describe(rig: Rig, families: Sequence[Crossed], assumed: Assumptions) -> list[Candidate]:
-    """The figures of ``families`` on ``rig``, whatever their periods are. Raises `RigError` where no pixel sees the
-    pattern."""
+    """The figures of ``families`` on ``rig``, whatever their periods are. Raises `RigError` where
+    no pixel sees the pattern."""
     if not families:
         return []
     lines = EpipolarLines.of(rig)
     near_mm, far_mm = lines.range_mm
     first, last = map(float, lines.places(np.array(assumed.surfaces_mm or (near_mm, far_mm))))
     if not -1e-9 <= first < last <= 1 + 1e-9:
-        raise RigError(f"surfaces: expected a part of the working range {near_mm:g} to {far_mm:g} mm")
+        raise RigError(
+            f"surfaces: expected a part of the working range {near_mm:g} to {far_mm:g} mm"
+        )
     return [_described(rig, lines, family, assumed, (first, last)) for family in families]
 
 
 def _described(
-    rig: Rig, lines: EpipolarLines, family: Crossed, assumed: Assumptions, surfaces: tuple[float, float]
+    rig: Rig,
+    lines: EpipolarLines,
+    family: Crossed,
+    assumed: Assumptions,
+    surfaces: tuple[float, float],
 ) -> Candidate:
-    """Errors are means over the lines; a phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))``
-    at noise s and modulation B."""
+    """Errors are means over the lines; a phase in a Gaussian window of sigma W has the noise ``s /
+    (B W sqrt(2 pi))`` at noise s and modulation B."""
     cycles, pitches = np.array(family.cycles_per_px), np.array(family.pitches_px)
     image_px = [rig.image_px_of_carrier(carrier) for carrier in family.cycles_per_px]
     turns, slopes = lines.across_px @ cycles.T, lines.far_px_per_mm @ cycles.T
     kept = np.exp(-2 * (math.pi * assumed.blur_px / pitches) ** 2)  # of the modulation, by the blur
     near_mm, far_mm = lines.range_mm
-    modulation = np.array(family.weights) * kept * (assumed.white_grey / 2 * (near_mm / far_mm) ** 2)
+    modulation = (
+        np.array(family.weights) * kept * (assumed.white_grey / 2 * (near_mm / far_mm) ** 2)
+    )
     noise = assumed.noise_grey / (modulation * WINDOW_PERIODS * max(image_px) * math.sqrt(TAU))
     error = np.hypot(assumed.phase_error / kept, noise)
     places = np.linspace(*surfaces, 41)
-    nearer = float(((lines.depths_mm(places) / far_mm) ** 2).mean())  # the same phase is less depth there
+    nearer = float(
+        ((lines.depths_mm(places) / far_mm) ** 2).mean()
+    )  # the same phase is less depth there
     with np.errstate(divide="ignore"):
         phase_mm = nearer / np.sqrt(((TAU * slopes / error) ** 2).sum(axis=-1))
     sigmas = assumed.edge_sigma / kept
     length = np.maximum(np.hypot(turns[:, 0], turns[:, 1]), np.finfo(np.float64).tiny)
     across = np.hypot(sigmas[0] * turns[:, 1], sigmas[1] * turns[:, 0]) / length
     share, wrong_mm = wrong_orders(lines, turns, across, assumed.edge_share, surfaces)
-    apart = None if lines.background is None else float(background_distance(turns, lines.background).min())
+    apart = (
+        None
+        if lines.background is None
+        else float(background_distance(turns, lines.background).min())
+    )
     return Candidate(
         crossed=family,
         rival_rad=float(rival_distance(turns).min()),
@@ -172,32 +208,41 @@ def _described(
 
 
 def square_pair(lines: EpipolarLines, pitch_px: float) -> Crossed:
-    """Two carriers of one period, square to each other. The first is turned from the direction in which the phase
-    changes fastest by ``atan(1 / (T + 1))``, T its turns over the range, so that the second, which then changes by less
-    than one turn, is at another phase at each of them."""
+    """Two carriers of one period, square to each other. The first is turned from the direction in
+    which the phase changes fastest by ``atan(1 / (T + 1))``, T its turns over the range, so that
+    the second, which then changes by less than one turn, is at another phase at each of them."""
     turns = float(np.hypot(*lines.across_px.T).max()) / pitch_px
     first = lines.flat_angle_deg + 90.0 + math.degrees(math.atan(1.0 / (turns + 1.0)))
-    return Crossed((pitch_px, pitch_px), (round(first % 180.0, 1), round((first - 90.0) % 180.0, 1)))
+    return Crossed(
+        (pitch_px, pitch_px), (round(first % 180.0, 1), round((first - 90.0) % 180.0, 1))
+    )
 
 
 def search(rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = None) -> Design:
-    """The best `square_pair` of all ``pitches_px``, by default all whole numbers that the image can hold: the one of
-    the least expected error. Raises `RigError` where the limits leave none."""
+    """The best `square_pair` of all ``pitches_px``, by default all whole numbers that the image can
+    hold: the one of the least expected error. Raises `RigError` where the limits leave none."""
     lines, (least, most) = EpipolarLines.of(rig), assumed.image_px
     longest = int(math.hypot(rig.projector.width, rig.projector.height))
     pitches = [
         float(pitch)
-        for pitch in (range(math.ceil(SMALLEST_PITCH_PX), longest + 1) if pitches_px is None else pitches_px)
+        for pitch in (
+            range(math.ceil(SMALLEST_PITCH_PX), longest + 1) if pitches_px is None else pitches_px
+        )
     ]
-    families = [square_pair(lines, pitch) for pitch in sorted(set(pitches)) if pitch >= SMALLEST_PITCH_PX]
+    families = [
+        square_pair(lines, pitch) for pitch in sorted(set(pitches)) if pitch >= SMALLEST_PITCH_PX
+    ]
 
     def fits(family: Crossed) -> bool:
-        return all(least <= rig.image_px_of_carrier(carrier) <= most for carrier in family.cycles_per_px)
+        return all(
+            least <= rig.image_px_of_carrier(carrier) <= most for carrier in family.cycles_per_px
+        )
 
     families = [family for family in families if fits(family)]
     if not families:
         raise RigError(
-            f"none of {len(pitches)} periods covers {least:g} to {most:g} px in an image of {rig.camera.width} x "
+            f"none of {len(pitches)} periods covers {least:g} to {most:g} px in an image of "
+            f"{rig.camera.width} x "
             f"{rig.camera.height} px; give other --pitches, or wider limits (--image-px)"
         )
     searched = tuple(describe(rig, families, assumed))
@@ -206,8 +251,9 @@ def search(rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = 
 
 @styled
 def draw_design(rig: Rig, found: Design, other: Candidate) -> bytes:
-    """PNG of the proposed pair beside an ``other`` one on ``rig``: both lines on the torus, the distance of the nearest
-    rival over depth, and the expected error of all pairs that were searched."""
+    """PNG of the proposed pair beside an ``other`` one on ``rig``: both lines on the torus, the
+    distance of the nearest rival over depth, and the expected error of all pairs that were
+    searched."""
     lines, proposed = EpipolarLines.of(rig), found.proposed
     drawn = figure(11, 10)
     plots = drawn.subplots(2, 2)
@@ -218,11 +264,20 @@ def draw_design(rig: Rig, found: Design, other: Candidate) -> bytes:
         distance = nearest(turns, -_PLACES, 1.0 - _PLACES).min(axis=0)
         plots[1, 0].plot(lines.depths_mm(_PLACES), distance, label=_title(candidate.crossed))
     plots[1, 0].set(
-        title="nearest rival over depth", xlabel="depth, mm", ylabel="distance of the phases, rad", ylim=(0, None)
+        title="nearest rival over depth",
+        xlabel="depth, mm",
+        ylabel="distance of the phases, rad",
+        ylim=(0, None),
     )
     pitches = [candidate.crossed.pitches_px[0] for candidate in found.searched]
-    for name, label in (("phase_mm", "phases"), ("wrong_mm", "wrong orders"), ("expected_mm", "both")):
-        plots[1, 1].plot(pitches, [getattr(candidate, name) for candidate in found.searched], ".-", label=label)
+    for name, label in (
+        ("phase_mm", "phases"),
+        ("wrong_mm", "wrong orders"),
+        ("expected_mm", "both"),
+    ):
+        plots[1, 1].plot(
+            pitches, [getattr(candidate, name) for candidate in found.searched], ".-", label=label
+        )
     plots[1, 1].set(
         title="expected error",
         xlabel="period of both carriers, projector px",
@@ -246,7 +301,9 @@ def _draw_torus(axes: "Axes", lines: EpipolarLines, candidate: Candidate) -> Non
     wrapped = _wrapped(turns[pixel], _PLACES)
     axes.plot(*wrapped.T, lw=2, color="C0", label="working range")
     for place, marker, label in ((0.0, "o", "near end"), (1.0, "s", "far end")):
-        axes.plot(*_wrapped(turns[pixel], np.array([place]))[0], marker, ms=9, color="C0", label=label)
+        axes.plot(
+            *_wrapped(turns[pixel], np.array([place]))[0], marker, ms=9, color="C0", label=label
+        )
     if lines.background is not None:
         axes.plot(
             *_wrapped(turns[pixel], lines.background[pixel : pixel + 1])[0],

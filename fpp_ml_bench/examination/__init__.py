@@ -1,1 +1,2 @@
-"""One examination of a capture, for decode, import and calibrate: what its frames say about themselves, as findings."""
+"""One examination of a capture, for decode, import and calibrate: what its frames say about
+themselves, as findings."""

@@ -1,12 +1,15 @@
-"""Whether camera and projector still stand and see as they were calibrated: the epipolar residual, as a whole.
+"""Whether camera and projector still stand and see as they were calibrated: the epipolar residual,
+as a whole.
 
-Where both directions are decoded, a pixel's projector point lies on the epipolar line of its ray. Its distance from
-that line is noise where the calibration fits. A device that moved, zoomed, or shows another window leaves a pattern
-over the image. Errors along the lines can't be seen, and they are what makes the depth wrong; a pattern across the
-lines says that there are such errors, and about how large they are.
+Where both directions are decoded, a pixel's projector point lies on the epipolar line of its ray.
+Its distance from that line is noise where the calibration fits. A device that moved, zoomed, or
+shows another window leaves a pattern over the image. Errors along the lines can't be seen, and they
+are what makes the depth wrong; a pattern across the lines says that there are such errors, and
+about how large they are.
 
-A cause is a change of one device's normalised coordinates, ``x + sum(p_k * term_k(x))``, or of the pose between the
-devices. Each is fitted by least squares with Tukey's weights. Those that explain the pattern are named.
+A cause is a change of one device's normalised coordinates, ``x + sum(p_k * term_k(x))``, or of the
+pose between the devices. Each is fitted by least squares with Tukey's weights. Those that explain
+the pattern are named.
 """
 
 import math
@@ -26,12 +29,15 @@ from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 from fpp_ml_bench.optics.sequence import AXES, Direction
 
 CALIBRATION_PX = 0.5
-"""Least RMS of the pattern, in projector px, that is worth a word. Our calibrations of six real board poses leave 0.07
-to 0.37 px, a public one 0.46 and 0.74, and the authors' own of the six poses 2 to 3."""
+"""Least RMS of the pattern, in projector px, that is worth a word. Our calibrations of six real
+board poses leave 0.07 to 0.37 px, a public one 0.46 and 0.74, and the authors' own of the six poses
+2 to 3."""
 LARGEST_CHANGE = 0.3
-"""Of a cause's parameter: 0.3 of the focal length, 17 degrees, 30%. More is another reading of the images."""
+"""Of a cause's parameter: 0.3 of the focal length, 17 degrees, 30%. More is another reading of the
+images."""
 UNEXPLAINED = 0.2
-"""Largest share of the pattern that a named cause may leave beside the noise: the calibration had one of its own."""
+"""Largest share of the pattern that a named cause may leave beside the noise: the calibration had
+one of its own."""
 ALIKE = 1.2
 """A cause explains as well as another one where it leaves at most so many times as much."""
 LEAST_REST_PX = 0.05
@@ -43,7 +49,8 @@ Residual = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class Seen(NamedTuple):
-    """Ideal normalised coordinates of the same points in both devices, and the pose between them."""
+    """Ideal normalised coordinates of the same points in both devices, and the pose between
+    them."""
 
     camera: Maps
     projector: Maps
@@ -52,9 +59,12 @@ class Seen(NamedTuple):
     focal_px: tuple[float, float]
 
     def px(self) -> NDArray[np.float64]:
-        """Signed distance of the projector's points from their epipolar lines, in undistorted projector px (n,)."""
+        """Signed distance of the projector's points from their epipolar lines, in undistorted
+        projector px (n,)."""
         (x, y), (u, v) = self.camera, self.projector
-        line = np.cross(self.translation, np.stack([x, y, np.ones_like(x)], axis=1) @ self.rotation.T)
+        line = np.cross(
+            self.translation, np.stack([x, y, np.ones_like(x)], axis=1) @ self.rotation.T
+        )
         length = np.hypot(line[:, 0] / self.focal_px[0], line[:, 1] / self.focal_px[1])
         with np.errstate(divide="ignore", invalid="ignore"):
             distance: NDArray[np.float64] = (line[:, 0] * u + line[:, 1] * v + line[:, 2]) / length
@@ -62,8 +72,8 @@ class Seen(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A kind of change: its number of ``parameters``, the ``terms`` that each adds to coordinates (x, y), and the
-    ``words`` for parameters and a focal length in px."""
+    """A kind of change: its number of ``parameters``, the ``terms`` that each adds to coordinates
+    (x, y), and the ``words`` for parameters and a focal length in px."""
 
     parameters: int
     terms: Callable[[NDArray, NDArray], list[tuple[NDArray, NDArray]]]
@@ -74,18 +84,26 @@ CHANGES: dict[Part, Change] = {
     "shift": Change(
         2,
         lambda x, y: [(1 + 0 * x, 0 * y), (0 * x, 1 + 0 * y)],
-        lambda p, f: f"another window or principal point, ({-f * p[0]:+.1f}, {-f * p[1]:+.1f}) px off",
+        lambda p, f: (
+            f"another window or principal point, ({-f * p[0]:+.1f}, {-f * p[1]:+.1f}) px off"
+        ),
     ),
     "turn": Change(
         2,
         lambda x, y: [(1 + x * x, x * y), (x * y, 1 + y * y)],
         lambda p, f: f"a turn by {np.rad2deg(np.hypot(*p)):.2f} degrees",
     ),
-    "roll": Change(1, lambda x, y: [(-y, x)], lambda p, f: f"a roll by {np.rad2deg(abs(p[0])):.2f} degrees"),
-    "zoom": Change(
-        1, lambda x, y: [(x, y)], lambda p, f: f"a focal length {100 / (1 + p[0]) - 100:+.2f}% off (zoom, focus)"
+    "roll": Change(
+        1, lambda x, y: [(-y, x)], lambda p, f: f"a roll by {np.rad2deg(abs(p[0])):.2f} degrees"
     ),
-    "keystone": Change(2, lambda x, y: [(x * x, x * y), (x * y, y * y)], lambda p, f: "a keystone correction"),
+    "zoom": Change(
+        1,
+        lambda x, y: [(x, y)],
+        lambda p, f: f"a focal length {100 / (1 + p[0]) - 100:+.2f}% off (zoom, focus)",
+    ),
+    "keystone": Change(
+        2, lambda x, y: [(x * x, x * y), (x * y, y * y)], lambda p, f: "a keystone correction"
+    ),
     "barrel": Change(
         1,
         lambda x, y: [(x * (x * x + y * y), y * (x * x + y * y))],
@@ -111,11 +129,17 @@ class Cause:
         if self.device == "pose":
             across = np.linalg.svd(seen.translation[None])[2][1:]  # its length leaves no pattern
             moved = seen.translation + np.linalg.norm(seen.translation) * change[3:] @ across
-            return seen._replace(rotation=seen.rotation @ rotation_matrix(tuple(change[:3])), translation=moved).px()
+            return seen._replace(
+                rotation=seen.rotation @ rotation_matrix(tuple(change[:3])), translation=moved
+            ).px()
         x, y = seen.camera if self.device == "camera" else seen.projector
         terms = np.array([term for part in self.parts for term in CHANGES[part].terms(x, y)])
         x, y = np.stack([x, y]) + np.tensordot(change, terms, axes=1)
-        return (seen._replace(camera=(x, y)) if self.device == "camera" else seen._replace(projector=(x, y))).px()
+        return (
+            seen._replace(camera=(x, y))
+            if self.device == "camera"
+            else seen._replace(projector=(x, y))
+        ).px()
 
     def words(self, change: NDArray[np.float64], rig: Rig) -> str:
         """What the change is, with its figures."""
@@ -124,7 +148,10 @@ class Cause:
             return f"camera and projector moved against each other (turned by {turn:.2f} degrees)"
         ends = np.cumsum([CHANGES[part].parameters for part in self.parts])
         focal_px = (rig.camera if self.device == "camera" else rig.projector).fx
-        said = [CHANGES[part].words(p, focal_px) for part, p in zip(self.parts, np.split(change, ends), strict=False)]
+        said = [
+            CHANGES[part].words(p, focal_px)
+            for part, p in zip(self.parts, np.split(change, ends), strict=False)
+        ]
         return f"of the {self.device}: {' and '.join(said)}"
 
 
@@ -139,26 +166,34 @@ _PARTS: tuple[tuple[Part, ...], ...] = (
     ("shift", "roll"),
     ("shift", "zoom", "keystone"),
 )
-CAUSES = (*(Cause(device, parts) for parts in _PARTS for device in ("camera", "projector")), Cause("pose", ()))
+CAUSES = (
+    *(Cause(device, parts) for parts in _PARTS for device in ("camera", "projector")),
+    Cause("pose", ()),
+)
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Of the epipolar residual over the image, in projector px: RMS of the pattern and what noise leaves beside it;
-    ``causes`` in words that explain it, the simplest ones."""
+    """Of the epipolar residual over the image, in projector px: RMS of the pattern and what noise
+    leaves beside it; ``causes`` in words that explain it, the simplest ones."""
 
     rms_px: float
     rest_px: float
     causes: tuple[str, ...]
 
 
-def epipolar_pattern(lines: Lines, rig: Rig, measured: Mapping[Direction, Coordinates]) -> Pattern | None:
-    """The pattern of pixels ``measured`` in both directions; None where there are too few, or noise explains it."""
+def epipolar_pattern(
+    lines: Lines, rig: Rig, measured: Mapping[Direction, Coordinates]
+) -> Pattern | None:
+    """The pattern of pixels ``measured`` in both directions; None where there are too few, or noise
+    explains it."""
     good = np.logical_and.reduce([coordinates.reason == 0 for coordinates in measured.values()])
     if len(measured) < 2 or good.sum() < LEAST_PX:
         return None
     rays = tuple(axis[lines.row[good], lines.column[good]] for axis in rig.camera.rays())
-    projector = rig.projector.normalised(*(measured[direction].coordinate_px[good] for direction in AXES))
+    projector = rig.projector.normalised(
+        *(measured[direction].coordinate_px[good] for direction in AXES)
+    )
     seen = Seen((rays[0], rays[1]), projector, rig.R, rig.t, rig.projector.focal)
     distance = seen.px()
     known = np.isfinite(distance)
@@ -181,18 +216,23 @@ def epipolar_pattern(lines: Lines, rig: Rig, measured: Mapping[Direction, Coordi
         if left_px <= enough_px and np.abs(change).max() <= LARGEST_CHANGE:
             fitting.append((cause.count, left_px, cause.words(change, rig)))
     fewest, best_px, _ = min(fitting, default=(0, 0.0, ""))
-    alike = [words for count, left_px, words in fitting if count == fewest and left_px <= ALIKE * best_px]
+    alike = [
+        words for count, left_px, words in fitting if count == fewest and left_px <= ALIKE * best_px
+    ]
     return Pattern(rms_px, rest_px, tuple(alike))
 
 
 def _fitted(residual: Residual, count: int) -> tuple[NDArray[np.float64], float]:
-    """The ``count`` parameters at which the residuals (n,) are least by Tukey's weights, and the robust standard
-    deviation of what is left."""
+    """The ``count`` parameters at which the residuals (n,) are least by Tukey's weights, and the
+    robust standard deviation of what is left."""
     change = np.zeros(count)
     for _ in range(_ROUNDS):
         left = residual(change)
-        slopes = np.stack([(residual(change + step) - left) / _STEP for step in _STEP * np.eye(count)], axis=1)
-        # Larger than noise while a pattern is left, so that no part of the pattern counts as an outlier.
+        slopes = np.stack(
+            [(residual(change + step) - left) / _STEP for step in _STEP * np.eye(count)], axis=1
+        )
+        # Larger than noise while a pattern is left, so that no part of the pattern counts as an
+        # outlier.
         size = np.abs(left) / max(_TUKEY * MAD_TO_SIGMA * float(np.median(np.abs(left))), 1e-9)
         weights = np.where(size < 1, 1 - size * size, 0.0)  # the root of Tukey's
         solution = np.linalg.lstsq(slopes * weights[:, None], -left * weights, rcond=_RANK)

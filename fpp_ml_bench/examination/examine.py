@@ -1,4 +1,5 @@
-"""The examination of a capture: before it is decoded, on some of its lines, from all that its frames and rig tell."""
+"""The examination of a capture: before it is decoded, on some of its lines, from all that its
+frames and rig tell."""
 
 import math
 from collections.abc import Sequence
@@ -35,34 +36,42 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 
 OFFSET_TURNS, OFFSET_EDGES = 0.02, 100
-"""Smallest common offset of phase and Gray code that is a finding: 0.4 px of 18 px, which no light of ours makes by
-more than chance; and the edges that are needed to measure it."""
+"""Smallest common offset of phase and Gray code that is a finding: 0.4 px of 18 px, which no light
+of ours makes by more than chance; and the edges that are needed to measure it."""
 RIPPLE_RAD, STEP_RAD = 0.02, 0.1
-"""Smallest ripple of twice the phase and smallest error of a shift that are findings: one of 8 frames half late makes
-0.05 and 0.37, one of 18 0.01 and 0.17; lamps that flicker by 2% make 0.012 with three steps, and turn no shift."""
+"""Smallest ripple of twice the phase and smallest error of a shift that are findings: one of 8
+frames half late makes 0.05 and 0.37, one of 18 0.01 and 0.17; lamps that flicker by 2% make 0.012
+with three steps, and turn no shift."""
 RESPONSE_RAD = 0.006
 """Smallest ripple of N times the phase that is named: patterns of 8 bits make 0.003."""
 TRIED, IN_RANGE = 0.1, 0.05
-"""Other readings are tried where more of the lit pixels contradict the code, or twice as many neighbours each other, or
-fewer fit it, or almost none lies in the range."""
+"""Other readings are tried where more of the lit pixels contradict the code, or twice as many
+neighbours each other, or fewer fit it, or almost none lies in the range."""
 MISALIGNED_SHARE = 0.0025
-"""Of the projector's larger side: an epipolar pattern (RMS) from which the depth can't be trusted, 3.2 px of 1280. The
-calibration that the authors of public captures used leaves 0.0017; depths by it are 1.2 mm off at 400 mm."""
+"""Of the projector's larger side: an epipolar pattern (RMS) from which the depth can't be trusted,
+3.2 px of 1280. The calibration that the authors of public captures used leaves 0.0017; depths by it
+are 1.2 mm off at 400 mm."""
 ALONG: dict[Direction | None, Side] = {"vertical": "rows", "horizontal": "columns"}
-"""Bands along which a code runs through many cells. Across them it has a few, which two bits may show alike."""
+"""Bands along which a code runs through many cells. Across them it has a few, which two bits may
+show alike."""
 MOST_UNLIKE_STEPS = 6
 """Up to so many steps those that follow one another are 60 degrees and more apart."""
 FEWEST_TURNS = 3.0
-"""Turns from bright to dark along a line from which two bits can't be alike by chance: silhouettes make one or two."""
+"""Turns from bright to dark along a line from which two bits can't be alike by chance: silhouettes
+make one or two."""
 TORN_SHARE, FEWEST_IN_BAND, MORE_IN_BAND = 0.8, 60, 0.4
-"""Largest share of the bands that are torn, where a tear and not the capture is at fault; the lit pixels that a band
-needs; and how much more of them contradict the code than in the best band: strong noise alone makes 0.2."""
+"""Largest share of the bands that are torn, where a tear and not the capture is at fault; the lit
+pixels that a band needs; and how much more of them contradict the code than in the best band:
+strong noise alone makes 0.2."""
 CONTRADICTING, DOUBTFUL = 0.6, 0.5
 """Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
 MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
-"""Share of the lit pixels at which mean images differ, averaged over so many neighbours, where the scene moved."""
+"""Share of the lit pixels at which mean images differ, averaged over so many neighbours, where the
+scene moved."""
 _FINEST, _SCORED_PX = 2.0, 4000
-CAPTURE_IN_TIME = "capture again: trigger the camera by the projector, or wait longer after each pattern"
+CAPTURE_IN_TIME = (
+    "capture again: trigger the camera by the projector, or wait longer after each pattern"
+)
 _UNITS = {
     1000.0: "metres were read as mm",
     10.0: "cm were read as mm",
@@ -81,10 +90,12 @@ def examine(
     limits: Limits | None = None,
     calibrated: bool = True,
 ) -> Examination:
-    """Examine the ``frames`` (F, H, W) of a rig's sequence, grey levels of 0 to 255; ``names`` are their files'.
+    """Examine the ``frames`` (F, H, W) of a rig's sequence, grey levels of 0 to 255; ``names`` are
+    their files'.
 
-    ``directions``: those that will be decoded (all). Pixels outside ``mask`` (H, W) don't count. ``calibrated`` False:
-    the rig's lenses, pose and range are placeholders, and only the code is looked at."""
+    ``directions``: those that will be decoded (all). Pixels outside ``mask`` (H, W) don't count.
+    ``calibrated`` False: the rig's lenses, pose and range are placeholders, and only the code is
+    looked at."""
     limits, directions = limits or Limits(), tuple(directions or rig.directions)
     if not directions:
         return Examination((), ("anything: no direction is coded pixel by pixel",))
@@ -92,7 +103,9 @@ def examine(
     lines, full_grey = marked_saturated(take_lines(frames, mask), rig, directions)
     not_checked = _not_checked(rig, directions, calibrated)
     if lines.lit.sum() < LEAST_PX:
-        return Examination((), (*not_checked, f"anything: only {lines.lit.sum()} pixels looked at are lit"))
+        return Examination(
+            (), (*not_checked, f"anything: only {lines.lit.sum()} pixels looked at are lit")
+        )
     sets = fringe_sets(lines, rig, directions)
     pairs = equal_frames(lines, sets, rig, directions)
     if pairs:
@@ -116,15 +129,23 @@ def examine(
         # A frame that is late shifts all phases, too.
         if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
             torn = _torn(lines, sets, shape, rig, directions, limits, titles)
-            return Examination(tuple(torn) or (_offset(found, rig, one.direction),), not_checked, measured)
-    doubtful = given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.coherent < TRIED
+            return Examination(
+                tuple(torn) or (_offset(found, rig, one.direction),), not_checked, measured
+            )
+    doubtful = (
+        given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.coherent < TRIED
+    )
     doubtful = doubtful or given.fitting < IN_RANGE * given.coherent
     if doubtful and (other := search(lines, rig, directions, limits, given, calibrated)):
         return Examination((_another_reading(other, given),), not_checked, measured)
     if torn := _torn(lines, sets, shape, rig, directions, limits, titles):
         return Examination(tuple(torn), not_checked, measured)
     findings += _exchanged_flat(lines, rig) or _moved(sets)
-    pattern = epipolar_pattern(part, rig, decoded_lines(part, rig, directions, limits)) if calibrated else None
+    pattern = (
+        epipolar_pattern(part, rig, decoded_lines(part, rig, directions, limits))
+        if calibrated
+        else None
+    )
     where = _contradicting_bands(part, given, shape)
     if pattern is not None:
         findings.append(_misaligned(pattern, rig))
@@ -137,7 +158,11 @@ def examine(
         findings.append(_contradictions(given, where))
     elif calibrated and given.fitting == 0.0 and given.depth_mm is not None:
         # Fewer come by chance.
-        findings += [_out_of_range(given.depth_mm, rig)] if len(given.depth_mm) > part.levels.shape[1] / 5 else []
+        findings += (
+            [_out_of_range(given.depth_mm, rig)]
+            if len(given.depth_mm) > part.levels.shape[1] / 5
+            else []
+        )
     findings.sort(key=lambda finding: ("refuse", "warn", "note").index(finding.severity))
     return Examination(tuple(findings), not_checked, measured, systematic, full_grey)
 
@@ -147,14 +172,19 @@ def _not_checked(rig: Rig, directions: Sequence[Direction], calibrated: bool) ->
     parts = []
     if len(directions) < 2:
         parts.append(
-            "images mirrored along the fringes, an inverted pose, another window of a sensor, and a camera or "
-            "projector that moved, turned or zoomed since its calibration: one direction of fringes can't tell"
+            "images mirrored along the fringes, an inverted pose, another window of a sensor, and "
+            "a camera or "
+            "projector that moved, turned or zoomed since its calibration: one direction of "
+            "fringes can't tell"
         )
     for way in directions:
         code = rig.code(way)
         if isinstance(code, PhaseShift):
             if code.gray is None:
-                parts.append(f"an offset of the {way} phases by whole fringes, or of all alike: no Gray code tells")
+                parts.append(
+                    f"an offset of the {way} phases by whole fringes, or of all alike: no Gray "
+                    f"code tells"
+                )
             if max(len(fringe.shifts_deg) for fringe in code.fringes) == 3:
                 parts.append(f"noise of the {way} frames: three steps fit any three grey levels")
     if not calibrated:
@@ -163,12 +193,15 @@ def _not_checked(rig: Rig, directions: Sequence[Direction], calibrated: bool) ->
 
 
 def _equal(pairs: Sequence[tuple[int, int]], titles: Sequence[str]) -> Finding:
-    listed = ", ".join(f"{titles[i]} and {titles[j]}" for i, j in pairs[:4]) + (" and others" if len(pairs) > 4 else "")
+    listed = ", ".join(f"{titles[i]} and {titles[j]}" for i, j in pairs[:4]) + (
+        " and others" if len(pairs) > 4 else ""
+    )
     return Finding(
         "equal frames",
         "refuse",
         f"{listed} show the same image, and their patterns differ",
-        "the camera delivered a frame twice, or a pattern was not shown in time, or a file was copied",
+        "the camera delivered a frame twice, or a pattern was not shown in time, or a file was "
+        "copied",
         CAPTURE_IN_TIME,
     )
 
@@ -177,7 +210,9 @@ def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
     black, white = rig.sequence.black, rig.sequence.white
     if black is None or white is None:
         return []
-    dark, bright = (lines.levels[index][lines.lit].astype(np.float64).mean() for index in (black, white))
+    dark, bright = (
+        lines.levels[index][lines.lit].astype(np.float64).mean() for index in (black, white)
+    )
     exchanged = Finding(
         "white and black",
         "refuse",
@@ -198,10 +233,12 @@ def _misaligned(pattern: Pattern, rig: Rig) -> Finding:
     return Finding(
         "calibration",
         "refuse" if pattern.rms_px > MISALIGNED_SHARE * width_px else "note",
-        f"the two directions miss each other's epipolar lines by {pattern.rms_px:.2f} projector px (RMS, and "
+        f"the two directions miss each other's epipolar lines by {pattern.rms_px:.2f} projector px "
+        f"(RMS, and "
         f"{pattern.rest_px:.2f} px by noise), in a pattern over the image",
         "; or ".join(pattern.causes) + alike,
-        "the stated uncertainty holds an error of this size; calibrate again as the devices stand now, or give the rig "
+        "the stated uncertainty holds an error of this size; calibrate again as the devices stand "
+        "now, or give the rig "
         "that took these frames",
     )
 
@@ -216,19 +253,24 @@ def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
         f"the {direction} phase at the edges of the Gray cells is {360 * turns.value:.1f} +- "
         f"{360 * turns.sigma:.1f} degrees off, {abs(turns.value) * pitch:.2f} projector px, "
         f"at {100 * found.agreeing:.0f}% of {found.edges} edges",
-        "the sinusoids begin elsewhere than at the Gray code's first pixel (another origin, or sine for cosine)",
-        f"if the Gray code begins at the pattern's first pixel: origin_px: {origin_px:.2f} ({direction}), or "
+        "the sinusoids begin elsewhere than at the Gray code's first pixel (another origin, or "
+        "sine for cosine)",
+        f"if the Gray code begins at the pattern's first pixel: origin_px: {origin_px:.2f} "
+        f"({direction}), or "
         f"{360 * turns.value:+.1f} degrees to every shift in shifts_deg",
     )
 
 
 def _another_reading(found: Sequence[tuple[Reading, Fit]], given: Fit) -> Finding:
-    listed = "; or ".join(f"{reading.what} ({100 * fits.fitting:.0f}%)" for reading, fits in found[:4])
+    listed = "; or ".join(
+        f"{reading.what} ({100 * fits.fitting:.0f}%)" for reading, fits in found[:4]
+    )
     alike = " (these frames can't tell which)" if len(found) > 1 else ""
     return Finding(
         "another reading fits",
         "refuse",
-        f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit another reading",
+        f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit "
+        f"another reading",
         f"{listed}{alike}",
         "; or ".join(dict.fromkeys(reading.change for reading, _ in found[:4])),
     )
@@ -251,35 +293,44 @@ def _steps_and_response(
     if (twice := waves.get(2)) is not None:
         measured[f"{one.direction}_{one.pitch_px:g}px_ripple_rad"] = twice.size.value
         if twice.size.exceeds(RIPPLE_RAD):
-            faults.append(f"the phase has an error of {twice.size.value:.3f} rad that repeats twice a period")
+            faults.append(
+                f"the phase has an error of {twice.size.value:.3f} rad that repeats twice a period"
+            )
     if faults:
         return [
             Finding(
                 "wrong step",
                 "refuse",
                 f"{name}: {', and '.join(faults)}, which neither noise nor gamma explains",
-                "a frame that was exposed while the pattern changed, came late, or was shown at another brightness",
+                "a frame that was exposed while the pattern changed, came late, or was shown at "
+                "another brightness",
                 CAPTURE_IN_TIME,
             )
         ]
     bent = waves.get(one.steps)
     if bent is None or not bent.size.exceeds(RESPONSE_RAD):
         return []
-    systematic[one.direction] = max(systematic.get(one.direction, 0.0), bent.size.value / math.sqrt(2))
+    systematic[one.direction] = max(
+        systematic.get(one.direction, 0.0), bent.size.value / math.sqrt(2)
+    )
     return [
         Finding(
             "response",
             "note",
-            f"{name}: the phase has an error of {bent.size.value:.3f} rad that repeats {one.steps} times a period",
-            "the response of projector and camera is not straight (gamma)" if bent.symmetric else "",
-            "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
+            f"{name}: the phase has an error of {bent.size.value:.3f} rad that repeats {one.steps} "
+            f"times a period",
+            "the response of projector and camera is not straight (gamma)"
+            if bent.symmetric
+            else "",
+            "the stated uncertainty holds it; set projector and camera to gamma 1, or use more "
+            "steps",
         )
     ]
 
 
 def _moved(sets: Sequence[FringeSet], torn: NDArray[np.bool_] | None = None) -> list[Finding]:
-    """Sets of sinusoids whose mean images differ: all of them show the scene under the same mean light. With ``torn``
-    pixels (n,) of the lines: the others alone are looked at."""
+    """Sets of sinusoids whose mean images differ: all of them show the scene under the same mean
+    light. With ``torn`` pixels (n,) of the lines: the others alone are looked at."""
     for one, other in combinations(sets, 2):
         both = one.good & other.good
         if torn is not None:
@@ -295,10 +346,13 @@ def _moved(sets: Sequence[FringeSet], torn: NDArray[np.bool_] | None = None) -> 
                 Finding(
                     "scene moved",
                     "refuse",
-                    f"the mean images of the {one.direction} fringes of {one.pitch_px:g} px and the "
+                    f"the mean images of the {one.direction} fringes of {one.pitch_px:g} px and "
+                    f"the "
                     f"{other.direction} ones "
-                    f"of {other.pitch_px:g} px differ at {100 * apart.mean():.0f}% of the lit pixels",
-                    "object or camera moved between them, the frames are of two captures, or a frame failed",
+                    f"of {other.pitch_px:g} px differ at {100 * apart.mean():.0f}% of the lit "
+                    f"pixels",
+                    "object or camera moved between them, the frames are of two captures, or a "
+                    "frame failed",
                     "put the frames of one capture, of a scene at rest, into the folder",
                 )
             ]
@@ -314,8 +368,9 @@ def _torn(
     limits: Limits,
     titles: Sequence[str],
 ) -> list[Finding]:
-    """Frames of which some rows or columns show another pattern than the rest; or, where the rest of the image differs
-    between the ``sets`` as well, a scene that moved: two scenes in one capture make lines look torn here and there."""
+    """Frames of which some rows or columns show another pattern than the rest; or, where the rest
+    of the image differs between the ``sets`` as well, a scene that moved: two scenes in one capture
+    make lines look torn here and there."""
     torn: dict[Side, dict[Band, list[str]]] = {"rows": {}, "columns": {}}
     sizes: dict[tuple[Side, str, float], dict[Band, Estimate]] = {}
     for band, inside in lines.banded(shape):
@@ -323,14 +378,20 @@ def _torn(
             continue
         part = lines.at(np.flatnonzero(inside))
         of_band = fringe_sets(part, rig, directions)
-        for i, j in equal_frames(part, [one for one in of_band if not one.one_phase], rig, directions, True):
+        for i, j in equal_frames(
+            part, [one for one in of_band if not one.one_phase], rig, directions, True
+        ):
             if not _never_alike(part, rig, band.side, i, j):
                 continue
-            torn[band.side].setdefault(band, []).append(f"{titles[j]} shows the image of {titles[i]}")
+            torn[band.side].setdefault(band, []).append(
+                f"{titles[j]} shows the image of {titles[i]}"
+            )
         for one in of_band:
             name = f"the {one.direction} fringes of {one.pitch_px:g} px"
             if (step := step_errors(one)) is not None:
-                sizes.setdefault((band.side, f"a step of {name} is wrong", STEP_RAD), {})[band] = step[1]
+                sizes.setdefault((band.side, f"a step of {name} is wrong", STEP_RAD), {})[band] = (
+                    step[1]
+                )
             edges = gray_edges(part, one, rig, limits)
             if edges is not None and edges.clear:
                 fault = f"{name} are shifted against the Gray code"
@@ -339,15 +400,20 @@ def _torn(
         smallest = min(of_bands.values(), key=lambda size: abs(size.value))
         wrong = []
         for band, size in of_bands.items():
-            apart = Estimate(abs(size.value) - abs(smallest.value), math.hypot(size.sigma, smallest.sigma))
+            apart = Estimate(
+                abs(size.value) - abs(smallest.value), math.hypot(size.sigma, smallest.sigma)
+            )
             if size.exceeds(least) and apart.exceeds(least):
                 wrong.append(band)
-        # Edges of Gray cells in fringes of few image px look shifted here and there; what is read late reaches an end.
+        # Edges of Gray cells in fringes of few image px look shifted here and there; what is read
+        # late reaches an end.
         bands = list(of_bands)
         if least == STEP_RAD or wrong in (bands[: len(wrong)], bands[len(bands) - len(wrong) :]):
             for band in wrong:
                 torn[side].setdefault(band, []).append(fault)
-    fewest = min((side for side in torn if torn[side]), key=lambda side: len(torn[side]), default=None)
+    fewest = min(
+        (side for side in torn if torn[side]), key=lambda side: len(torn[side]), default=None
+    )
     if fewest is None:
         return []
     shown = sorted(torn[fewest], key=lambda band: band.first)
@@ -362,7 +428,8 @@ def _torn(
             "torn frames",
             "refuse",
             f"{_ranges(shown)} differ from the other {fewest}: {', '.join(said[:3])}{more}",
-            f"the projector changed its picture while the camera exposed or read these {fewest} (no synchronisation, "
+            f"the projector changed its picture while the camera exposed or read these {fewest} "
+            f"(no synchronisation, "
             "or a rolling shutter)",
             CAPTURE_IN_TIME + "; a rolling shutter needs exposures of whole projector frames",
         )
@@ -370,12 +437,18 @@ def _torn(
 
 
 def _never_alike(part: Lines, rig: Rig, side: Side, i: int, j: int) -> bool:
-    """Whether two frames that follow one another can't look alike in a band of such a ``side``, unless one is torn."""
+    """Whether two frames that follow one another can't look alike in a band of such a ``side``,
+    unless one is torn."""
     first, second = rig.sequence.frames[i], rig.sequence.frames[j]
     along = all(ALONG.get(frame.direction, side) == side for frame in (first, second))
-    of_one_set = (first.kind, first.direction, first.fringe) == (second.kind, second.direction, second.fringe)
+    of_one_set = (first.kind, first.direction, first.fringe) == (
+        second.kind,
+        second.direction,
+        second.fringe,
+    )
     if of_one_set and first.kind == "sinusoid" and first.direction is not None:
-        # Steps near each other differ little, and with many of them a torn one is a wrong step anyway.
+        # Steps near each other differ little, and with many of them a torn one is a wrong step
+        # anyway.
         return along or len(rig.sequence.period(first.direction, first.fringe)) <= MOST_UNLIKE_STEPS
     its_inverse = of_one_set and first.step == second.step
     return along or its_inverse or turns(part, j) >= FEWEST_TURNS
@@ -393,8 +466,9 @@ def _ranges(bands: Sequence[Band]) -> str:
 
 
 def _contradicting_bands(part: Lines, given: Fit, shape: tuple[int, int]) -> str:
-    """The rows or columns in which far more of the lit pixels contradict the code than in others, in words; "" where
-    none do. They reach an end of the image, as those do that were read too late; what a scene does may be anywhere."""
+    """The rows or columns in which far more of the lit pixels contradict the code than in others,
+    in words; "" where none do. They reach an end of the image, as those do that were read too late;
+    what a scene does may be anywhere."""
     if given.lit is None or given.against is None:
         return ""
     shares: dict[Side, dict[Band, float]] = {"rows": {}, "columns": {}}
@@ -403,9 +477,16 @@ def _contradicting_bands(part: Lines, given: Fit, shape: tuple[int, int]) -> str
         if np.count_nonzero(lit) >= FEWEST_IN_BAND:
             shares[band.side][band] = float(given.against[lit].mean())
     for of_bands in shares.values():
-        more = [band for band, share in of_bands.items() if share > min(of_bands.values()) + MORE_IN_BAND]
+        more = [
+            band
+            for band, share in of_bands.items()
+            if share > min(of_bands.values()) + MORE_IN_BAND
+        ]
         bands = list(of_bands)
-        if 0 < len(more) <= TORN_SHARE * len(bands) and more in (bands[: len(more)], bands[-len(more) :]):
+        if 0 < len(more) <= TORN_SHARE * len(bands) and more in (
+            bands[: len(more)],
+            bands[-len(more) :],
+        ):
             return f", most in {_ranges(more)}"
     return ""
 
@@ -414,25 +495,36 @@ def _contradictions(given: Fit, where: str) -> Finding:
     return Finding(
         "contradictions",
         "refuse" if given.contradicting > CONTRADICTING else "warn",
-        f"{100 * given.contradicting:.0f}% of the lit pixels contradict the code{where}, and no other reading fits",
+        f"{100 * given.contradicting:.0f}% of the lit pixels contradict the code{where}, and no "
+        f"other reading fits",
         "",
-        "look whether sequence, projector size and pose in the rig file are those of this capture, and whether the "
-        "scene moved: compare the first and last image with the first and last pattern (fpp-bench patterns)",
+        "look whether sequence, projector size and pose in the rig file are those of this capture, "
+        "and whether the "
+        "scene moved: compare the first and last image with the first and last pattern (fpp-bench "
+        "patterns)",
     )
 
 
 def _out_of_range(depth_mm: NDArray[np.float64], rig: Rig) -> Finding:
     low, middle, high = np.quantile(depth_mm, (0.02, 0.5, 0.98))
     near, far = rig.working_range_mm
-    cause, change = "another working range than the rig file's", f"give the range: --working-range {low:.0f},{high:.0f}"
-    if units := [f"{why} ({factor:g} times)" for factor, why in _UNITS.items() if near <= factor * middle <= far]:
+    cause, change = (
+        "another working range than the rig file's",
+        f"give the range: --working-range {low:.0f},{high:.0f}",
+    )
+    if units := [
+        f"{why} ({factor:g} times)"
+        for factor, why in _UNITS.items()
+        if near <= factor * middle <= far
+    ]:
         cause = f"a wrong unit of the rig's translation: {units[0]}"
         change = "correct the translation or the calibration's unit"
     baseline = MM_PER_M * rig.baseline_m
     return Finding(
         "nothing in the range",
         "refuse",
-        f"depths of {low:.4g} to {high:.4g} mm, a baseline of {baseline:.4g} mm, and a range of {near:g} to {far:g} mm",
+        f"depths of {low:.4g} to {high:.4g} mm, a baseline of {baseline:.4g} mm, and a range of "
+        f"{near:g} to {far:g} mm",
         cause,
         change,
     )

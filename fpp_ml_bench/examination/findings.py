@@ -1,4 +1,5 @@
-"""What an examination finds, as data: a name, how bad it is, the evidence, the likely cause, and what to change."""
+"""What an examination finds, as data: a name, how bad it is, the evidence, the likely cause, and
+what to change."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,9 +13,9 @@ Severity = Literal["refuse", "warn", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """``severity`` "refuse": the depth can't be trusted; "warn": it is doubtful; "note": it is worth knowing.
-    ``evidence`` says what was measured, ``cause`` what most likely made it ("": nothing that was tried fits), and
-    ``change`` what to do, a clause each."""
+    """``severity`` "refuse": the depth can't be trusted; "warn": it is doubtful; "note": it is
+    worth knowing. ``evidence`` says what was measured, ``cause`` what most likely made it ("":
+    nothing that was tried fits), and ``change`` what to do, a clause each."""
 
     name: str
     severity: Severity
@@ -29,9 +30,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Examination:
-    """The ``findings``, worst first; what the frames of this rig can't tell (``not_checked``); ``measured`` figures by
-    name; ``systematic_rad``, by direction, the RMS error of the finest phase that the response of projector and camera
-    and an epipolar pattern cause (0 where none shows); ``full_grey``: the grey level at which pixels are saturated."""
+    """The ``findings``, worst first; what the frames of this rig can't tell (``not_checked``);
+    ``measured`` figures by name; ``systematic_rad``, by direction, the RMS error of the finest
+    phase that the response of projector and camera and an epipolar pattern cause (0 where none
+    shows); ``full_grey``: the grey level at which pixels are saturated."""
 
     findings: tuple[Finding, ...] = ()
     not_checked: tuple[str, ...] = ()
@@ -50,7 +52,9 @@ class RefusedCapture(CaptureError):
     def __init__(self, where: str, examination: Examination) -> None:
         self.where, self.examination = where, examination
         listed = "\n  ".join(map(str, examination.refused))
-        super().__init__(f"{where}: {listed}\n  --anyway goes on all the same; its depth is not to be trusted")
+        super().__init__(
+            f"{where}: {listed}\n  --anyway goes on all the same; its depth is not to be trusted"
+        )
 
     def __reduce__(self) -> tuple[type["RefusedCapture"], tuple[str, Examination]]:
         return type(self), (self.where, self.examination)  # from worker processes, too

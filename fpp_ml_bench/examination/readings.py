@@ -1,8 +1,10 @@
-"""Other readings of a capture: the same images in another order, seen another way round, with bits read another way.
+"""Other readings of a capture: the same images in another order, seen another way round, with bits
+read another way.
 
-Each is tried on some thousand pixels. It fits by the share of the lit pixels that get a depth in the range, times what
-neighbours say: phases go on at the edges of Gray cells, and on a surface that both devices see the projector's
-coordinates grow along the image as they do on a plane (the ordering constraint of stereo vision).
+Each is tried on some thousand pixels. It fits by the share of the lit pixels that get a depth in
+the range, times what neighbours say: phases go on at the edges of Gray cells, and on a surface that
+both devices see the projector's coordinates grow along the image as they do on a plane (the
+ordering constraint of stereo vision).
 """
 
 import math
@@ -24,13 +26,16 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES, Direction, Frame
 
 LARGEST_MISFIT = 0.2
-"""Largest RMS distance of grey levels from their sinusoid, in modulations, where four steps and more tell."""
+"""Largest RMS distance of grey levels from their sinusoid, in modulations, where four steps and
+more tell."""
 CLEARLY_LIT_GREY = 30.0
 """Pixels whose grey levels differ by so much from frame to frame have to be lit by any reading."""
 LARGEST_DISAGREEMENT_PX = 8.0
-"""Distance across the epipolar line from which a pixel contradicts: less is a calibration's error."""
+"""Distance across the epipolar line from which a pixel contradicts: less is a calibration's
+error."""
 GOOD, FEWER = 0.8, 3.0
-"""A reading is named that fits so well, and leaves so many times fewer pixels that contradict it than the one given."""
+"""A reading is named that fits so well, and leaves so many times fewer pixels that contradict it
+than the one given."""
 _FIRST_PX, _SECOND_PX, _FEWEST_PAIRS, _KEPT = 600, 4000, 40, 8
 _BACKGROUND_SHARE = 0.03
 _WIDE_MM = (1e-6, 1e12)
@@ -41,8 +46,8 @@ Change = Callable[[Lines, Rig], tuple[Lines, Rig]]
 
 @dataclass(frozen=True)
 class Reading:
-    """A way to read the images: ``what`` is different from the rig file, the ``change`` to do, and ``seen``, which
-    gives the lines and the rig as this reading has them."""
+    """A way to read the images: ``what`` is different from the rig file, the ``change`` to do, and
+    ``seen``, which gives the lines and the rig as this reading has them."""
 
     what: str
     change: str
@@ -61,7 +66,9 @@ def _with_levels(change: Callable[[NDArray], NDArray]) -> Change:
 def _flipped(across: bool, down: bool) -> Change:
     def seen(lines: Lines, rig: Rig) -> tuple[Lines, Rig]:
         column = rig.camera.width - 1 - lines.column if across else lines.column
-        return replace(lines, column=column, row=rig.camera.height - 1 - lines.row if down else lines.row), rig
+        return replace(
+            lines, column=column, row=rig.camera.height - 1 - lines.row if down else lines.row
+        ), rig
 
     return seen
 
@@ -73,9 +80,10 @@ def _inverse_pose(lines: Lines, rig: Rig) -> tuple[Lines, Rig]:
 
 @dataclass(frozen=True)
 class Fit:
-    """Shares of the lit pixels: ``coherent`` with the code and their neighbours, and so and in the range, ``fitting``;
-    ``contradicting`` the code. ``agreeing``: what neighbours say, 1 or less. ``depth_mm``: of coherent pixels, whatever
-    the range. ``against`` bool (n,): which of the ``lit`` pixels, bool (n,), contradict the code."""
+    """Shares of the lit pixels: ``coherent`` with the code and their neighbours, and so and in the
+    range, ``fitting``; ``contradicting`` the code. ``agreeing``: what neighbours say, 1 or less.
+    ``depth_mm``: of coherent pixels, whatever the range. ``against`` bool (n,): which of the
+    ``lit`` pixels, bool (n,), contradict the code."""
 
     coherent: float = 0.0
     fitting: float = 0.0
@@ -94,11 +102,22 @@ def decoded_lines(
 ) -> dict[Direction, Coordinates]:
     """The projector's coordinates of the lines' pixels."""
     plans = [plan_direction(rig, direction, None) for direction in directions]
-    return {plan.direction: plan.decode(np.ascontiguousarray(lines.levels[list(plan.rows)]), limits) for plan in plans}
+    return {
+        plan.direction: plan.decode(np.ascontiguousarray(lines.levels[list(plan.rows)]), limits)
+        for plan in plans
+    }
 
 
-def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, reading: Reading, solid: bool) -> Fit:
-    """How well the reading fits; without ``solid`` (a rig that is not calibrated) depth and order don't count."""
+def fit(
+    lines: Lines,
+    rig: Rig,
+    directions: Sequence[Direction],
+    limits: Limits,
+    reading: Reading,
+    solid: bool,
+) -> Fit:
+    """How well the reading fits; without ``solid`` (a rig that is not calibrated) depth and order
+    don't count."""
     lines, rig = reading.seen(lines, rig)
     levels = lines.levels
     measured, edges = decoded_lines(lines, rig, directions, limits), 1.0
@@ -114,19 +133,31 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
         if one.steps > 3:
             shown = one.mean + one.modulation * np.cos(one.phase + one.shifts_rad[:, None])
             misfit = ((one.levels - shown) ** 2).mean(axis=0)
-            reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = Reason.INCONSISTENT_ORDER
+            reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = (
+                Reason.INCONSISTENT_ORDER
+            )
         found = gray_edges(lines, one, rig, limits)
-        edges *= 1.0 if found is None or found.edges < _FEWEST_PAIRS else min(found.agreeing, found.forward)
+        edges *= (
+            1.0
+            if found is None or found.edges < _FEWEST_PAIRS
+            else min(found.agreeing, found.forward)
+        )
     bright = max(int((lit | saturated).sum()), 1)
     counted = (lit | (np.ptp(levels, axis=0) >= CLEARLY_LIT_GREY)) & ~saturated
     if not counted.any():
         return Fit()
     if not solid:
         share = edges * float((reason[counted] == 0).mean())
-        return Fit(share, share, float(contradicting.sum()) / bright, edges, None, lit, contradicting)
+        return Fit(
+            share, share, float(contradicting.sum()) / bright, edges, None, lit, contradicting
+        )
     rays = tuple(axis[lines.row, lines.column] for axis in rig.camera.rays())
     forward = min(
-        (_forward(lines, rays, measured[way].coordinate_px, reason == 0, rig, way) for way in directions), default=1.0
+        (
+            _forward(lines, rays, measured[way].coordinate_px, reason == 0, rig, way)
+            for way in directions
+        ),
+        default=1.0,
     )
     apart_px = LARGEST_DISAGREEMENT_PX + math.hypot(*(rig.code(way).step_px for way in directions))
     wide, loose = rig.with_range(_WIDE_MM), replace(limits, max_disagreement_px=apart_px)
@@ -136,7 +167,10 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
     near, far = rig.working_range_mm
     inside = (depth_mm >= near) & (depth_mm <= far)
     if rig.background_m is not None:
-        inside |= np.abs(depth_mm - rig.background_m * MM_PER_M) < _BACKGROUND_SHARE * rig.background_m * MM_PER_M
+        inside |= (
+            np.abs(depth_mm - rig.background_m * MM_PER_M)
+            < _BACKGROUND_SHARE * rig.background_m * MM_PER_M
+        )
     coherent, fitting = float(good[counted].mean()), float((good & inside)[counted].mean())
     weight, against = edges * min(1.0, 2 * forward), float(contradicting.sum()) / bright
     depths_mm = depth_mm[good].astype(np.float64)
@@ -151,9 +185,12 @@ def _forward(
     rig: Rig,
     direction: Direction,
 ) -> float:
-    """Share of neighbours between which the coordinate grows as it does on a plane in the middle of the range."""
+    """Share of neighbours between which the coordinate grows as it does on a plane in the middle of
+    the range."""
     middle_m = sum(rig.working_range_mm) / 2 / MM_PER_M
-    points = np.stack([rays[0] * middle_m, rays[1] * middle_m, np.full_like(rays[0], middle_m)], axis=-1)
+    points = np.stack(
+        [rays[0] * middle_m, rays[1] * middle_m, np.full_like(rays[0], middle_m)], axis=-1
+    )
     on_plane, change = np.diff(rig.project(points)[AXES.index(direction)]), np.diff(coordinate_px)
     with np.errstate(invalid="ignore"):
         used = lines.joined[:-1] & known[:-1] & known[1:] & (change != 0) & np.isfinite(on_plane)
@@ -172,11 +209,19 @@ def search(
     """The readings that fit far better than the one ``given``, best first; none where none does."""
     few, more = lines.part(_FIRST_PX), lines.part(_SECOND_PX)
     for candidates in (_single(rig, solid), _exchanges(rig)):
-        first = [(reading, fit(few, rig, directions, limits, reading, solid)) for reading in candidates]
+        first = [
+            (reading, fit(few, rig, directions, limits, reading, solid)) for reading in candidates
+        ]
         first.sort(key=lambda pair: -pair[1].fitting)
-        second = [(reading, fit(more, rig, directions, limits, reading, solid)) for reading, _ in first[:_KEPT]]
+        second = [
+            (reading, fit(more, rig, directions, limits, reading, solid))
+            for reading, _ in first[:_KEPT]
+        ]
         needed = max(GOOD, 1 - (1 - given.fitting) / FEWER)
-        named = sorted((pair for pair in second if pair[1].fitting >= needed), key=lambda pair: -pair[1].fitting)
+        named = sorted(
+            (pair for pair in second if pair[1].fitting >= needed),
+            key=lambda pair: -pair[1].fitting,
+        )
         if named:
             best = named[0][1].fitting
             return [pair for pair in named if 1 - pair[1].fitting <= FEWER * (1 - best) + 0.02]
@@ -205,22 +250,31 @@ def _single(rig: Rig, solid: bool) -> Iterator[Reading]:
     for ways, of in ((rig.directions, ""), *(((way,), f"{way} ") for way in alone)):
         for reading in _of_code(rig, [run for run in runs if frames[run[0]].direction in ways]):
             yield replace(reading, what=of + reading.what)
-    yield Reading("all frames inverted (black for white)", "invert the images", _with_levels(_inverted))
+    yield Reading(
+        "all frames inverted (black for white)", "invert the images", _with_levels(_inverted)
+    )
     change = "rename the files in the opposite order"
     yield Reading("all frames in the opposite order", change, _in_order(everything[::-1]))
     for shift in range(1, len(frames)):
         change = f"rename the files: the first {len(frames) - shift} are the sequence's last ones"
         captured = everything[shift:] + everything[:shift]
-        yield Reading(f"a capture that starts with frame {frames[shift].title}", change, _captured(captured))
-    orders = dict.fromkeys(tuple(index for run in ordered for index in run) for ordered in _orders(frames, runs))
+        yield Reading(
+            f"a capture that starts with frame {frames[shift].title}", change, _captured(captured)
+        )
+    orders = dict.fromkeys(
+        tuple(index for run in ordered for index in run) for ordered in _orders(frames, runs)
+    )
     for order in orders:
         if list(order) != everything:
             change = "write this order in the rig file's sequence, or rename the files"
-            yield Reading(f"frames in the order {', '.join(_names(frames, order))}", change, _captured(order))
+            yield Reading(
+                f"frames in the order {', '.join(_names(frames, order))}", change, _captured(order)
+            )
 
 
 def _captured(indices: Sequence[int]) -> Change:
-    """The frames of the sequence where they are in a capture that holds ``indices`` in this order."""
+    """The frames of the sequence where they are in a capture that holds ``indices`` in this
+    order."""
     return _in_order(np.argsort(indices).tolist())
 
 
@@ -239,7 +293,8 @@ def _of_code(rig: Rig, own: list[list[int]]) -> Iterator[Reading]:
         return place
 
     def rearranged(run: list[int], changes: Mapping[str, Any]) -> list[int]:
-        """Where the Gray frames of ``run`` are, when captured as with ``changes`` of their `GrayCells`."""
+        """Where the Gray frames of ``run`` are, when captured as with ``changes`` of their
+        `GrayCells`."""
         code: Any = rig.code(frames[run[0]].direction or "vertical")
         cells: GrayCells = code if isinstance(code, GrayOnly) else code.gray
         if "inverse" in changes and cells.inverse == "none":
@@ -250,7 +305,9 @@ def _of_code(rig: Rig, own: list[list[int]]) -> Iterator[Reading]:
     if sinusoids:
         flipped = moved(sinusoids, lambda run: [run[0], *run[:0:-1]])
         yield Reading(
-            "phase shifts of the other sign", "change the entry sign of the sequence (1, -1)", _in_order(flipped)
+            "phase shifts of the other sign",
+            "change the entry sign of the sequence (1, -1)",
+            _in_order(flipped),
         )
         for quarters in (1, 2, 3):
             if all(quarters * len(run) % 4 == 0 for run in sinusoids):
@@ -258,7 +315,11 @@ def _of_code(rig: Rig, own: list[list[int]]) -> Iterator[Reading]:
                 what = f"phases that are {90 * quarters} degrees further (sine for cosine)"
                 yield Reading(what, "give shifts_deg with this angle added", _in_order(turned))
         backward, change = moved(sinusoids, lambda run: run[::-1]), "give shifts_deg in this order"
-        yield Reading("phase steps in the opposite order", f"rename the files, or {change}", _in_order(backward))
+        yield Reading(
+            "phase steps in the opposite order",
+            f"rename the files, or {change}",
+            _in_order(backward),
+        )
     if bits:
         for key, value, what in (
             ("least_first", True, "with the least significant bit first"),
@@ -268,12 +329,16 @@ def _of_code(rig: Rig, own: list[list[int]]) -> Iterator[Reading]:
         ):
             place = moved(bits, partial(rearranged, changes={key: value}))
             if place != everything:
-                yield Reading(f"Gray code {what}", f"write {key}: {str(value).lower()}", _in_order(place))
+                yield Reading(
+                    f"Gray code {what}", f"write {key}: {str(value).lower()}", _in_order(place)
+                )
         change = "project it as the rig file says, or exchange white and black of its images"
         levels = _with_levels(partial(_gray_levels, bits, True))
         yield Reading("Gray code that is inverted (black for white)", change, levels)
         change = "project Gray code: at the edges of binary numbers several bits change at once"
-        yield Reading("binary numbers for Gray code", change, _with_levels(partial(_gray_levels, bits, False)))
+        yield Reading(
+            "binary numbers for Gray code", change, _with_levels(partial(_gray_levels, bits, False))
+        )
 
 
 def _turned(quarters: int, run: list[int]) -> list[int]:
@@ -281,7 +346,9 @@ def _turned(quarters: int, run: list[int]) -> list[int]:
 
 
 def _inverted(levels: NDArray) -> NDArray:
-    return levels.max(axis=0) + (levels.min(axis=0) - levels)  # unsigned grey levels wrap twice, and come out right
+    return levels.max(axis=0) + (
+        levels.min(axis=0) - levels
+    )  # unsigned grey levels wrap twice, and come out right
 
 
 def _gray_levels(runs: list[list[int]], invert: bool, levels: NDArray) -> NDArray:
@@ -303,7 +370,9 @@ def _orders(frames: Sequence[Frame], runs: list[list[int]]) -> Iterator[list[lis
     directions = dict.fromkeys(frame.direction for frame in firsts if frame.direction)
     for kinds in permutations(dict.fromkeys(frame.kind for frame in firsts)):
         for ways in permutations(directions):
-            ranks = [(kinds.index(frame.kind), (None, *ways).index(frame.direction)) for frame in firsts]
+            ranks = [
+                (kinds.index(frame.kind), (None, *ways).index(frame.direction)) for frame in firsts
+            ]
             for major in (0, 1):
                 keys = [(rank[major], rank[1 - major]) for rank in ranks]
                 yield [runs[i] for i in sorted(range(len(runs)), key=keys.__getitem__)]
@@ -334,5 +403,7 @@ def _exchanges(rig: Rig) -> Iterator[Reading]:
         place[first], place[second] = second, first
         titles = [frames[index].title for index in (first, second)]
         yield Reading(
-            f"frames that changed places: {titles[0]} and {titles[1]}", "rename these two files", _in_order(place)
+            f"frames that changed places: {titles[0]} and {titles[1]}",
+            "rename these two files",
+            _in_order(place),
         )

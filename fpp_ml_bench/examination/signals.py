@@ -1,10 +1,12 @@
-"""What sinusoids and Gray code say about a capture: equal frames, wrong steps, ripples of the phase, common offsets.
+"""What sinusoids and Gray code say about a capture: equal frames, wrong steps, ripples of the
+phase, common offsets.
 
-Looked at are some rows and columns of the image, whose pixels have neighbours (`Lines`). A frame that shows another
-step than it should leaves a residual in the first harmonic of its set, and a ripple of twice the phase in the decoded
-phase. A response that is not straight leaves higher harmonics, and a ripple of N times the phase with N steps (K.
-Hibino et al., Phase shifting for nonsinusoidal waveforms with phase-shift errors, JOSA A 1995). Both are measured from
-what neighbours can't have in common with the scene: a surface is smooth within a few periods.
+Looked at are some rows and columns of the image, whose pixels have neighbours (`Lines`). A frame
+that shows another step than it should leaves a residual in the first harmonic of its set, and a
+ripple of twice the phase in the decoded phase. A response that is not straight leaves higher
+harmonics, and a ripple of N times the phase with N steps (K. Hibino et al., Phase shifting for
+nonsinusoidal waveforms with phase-shift errors, JOSA A 1995). Both are measured from what
+neighbours can't have in common with the scene: a surface is smooth within a few periods.
 """
 
 import math
@@ -28,26 +30,29 @@ LEAST_LIT_GREY = 3 * MIN_MODULATION
 _LOOKED_AT_PX = 40_000
 LEAST_PX = 200
 WINDOW_PERIODS = 2.5
-"""Length of the windows in which a surface is taken for a cubic; a period must be seen by 4 px and more."""
+"""Length of the windows in which a surface is taken for a cubic; a period must be seen by 4 px and
+more."""
 SHORTEST_PERIOD_PX, LONGEST_WINDOW_PX, FEWEST_WINDOWS = 4.0, 400, 30
 WHITE_RATIO, EQUAL_SHARE, GAIN = 1.8, 0.35, 0.1
-"""Two frames are equal where their difference is white (its mean square below so many times that of noise), below a
-share of what their steps would make, and their gain within this of 1."""
+"""Two frames are equal where their difference is white (its mean square below so many times that of
+noise), below a share of what their steps would make, and their gain within this of 1."""
 _EQUAL_PX = 30_000
 SYMMETRIC = 0.3
 """Largest share of the cosine in a ripple that a response can make: a response alone makes none."""
 SIGMAS = 6.0
 """Standard errors above which a figure is none of chance."""
 BANDS = 16
-"""Of rows and of columns, each looked at by itself: a tear is missed in the last sixteenth of the image at most."""
+"""Of rows and of columns, each looked at by itself: a tear is missed in the last sixteenth of the
+image at most."""
 ONE_PHASE = 0.7
-"""Mean resultant length of the phases in a band that fringes hardly cross: two steps may be equally bright there."""
+"""Mean resultant length of the phases in a band that fringes hardly cross: two steps may be equally
+bright there."""
 PILED_SHARE, PILE_DEPTH = 0.01, 0.03
-"""Levels are saturated where so many of them are the highest one exactly, more than in this part of the levels below
-it. A whole crest without noise has half as many there."""
+"""Levels are saturated where so many of them are the highest one exactly, more than in this part of
+the levels below it. A whole crest without noise has half as many there."""
 CLEAR_LEVELS = 0.15
-"""Distance from the middle grey level, in spans, from which a pixel is bright or dark: Gray frames have 0.5, sinusoids
-0.35 in the median, and blurred fringes less."""
+"""Distance from the middle grey level, in spans, from which a pixel is bright or dark: Gray frames
+have 0.5, sinusoids 0.35 in the median, and blurred fringes less."""
 
 
 Side = Literal["rows", "columns"]
@@ -55,8 +60,9 @@ Side = Literal["rows", "columns"]
 
 @dataclass(frozen=True)
 class Lines:
-    """``levels`` (F, n) of n pixels at ``column`` and ``row``, line after line. ``joined``: the next pixel is the
-    neighbour on the same line; ``across``: the line is a row; ``lit`` pixels change from frame to frame."""
+    """``levels`` (F, n) of n pixels at ``column`` and ``row``, line after line. ``joined``: the
+    next pixel is the neighbour on the same line; ``across``: the line is a row; ``lit`` pixels
+    change from frame to frame."""
 
     levels: NDArray
     column: NDArray[np.intp]
@@ -77,12 +83,22 @@ class Lines:
     def at(self, picked: NDArray[np.intp]) -> "Lines":
         """The pixels at the ascending indices ``picked``."""
         joined = self.joined[picked] & np.append(np.diff(picked) == 1, False)
-        others = self.column[picked], self.row[picked], joined, self.across[picked], self.lit[picked]
+        others = (
+            self.column[picked],
+            self.row[picked],
+            joined,
+            self.across[picked],
+            self.lit[picked],
+        )
         return Lines(self.levels[:, picked], *others)
 
     def banded(self, shape: tuple[int, int]) -> Iterator[tuple["Band", NDArray[np.bool_]]]:
-        """The bands of an image of ``shape`` (H, W), of rows and then of columns, and which pixels (n,) lie in each."""
-        sides: tuple[tuple[Side, NDArray[np.intp]], ...] = (("rows", self.row), ("columns", self.column))
+        """The bands of an image of ``shape`` (H, W), of rows and then of columns, and which pixels
+        (n,) lie in each."""
+        sides: tuple[tuple[Side, NDArray[np.intp]], ...] = (
+            ("rows", self.row),
+            ("columns", self.column),
+        )
         for (side, position), length in zip(sides, shape, strict=True):
             number = position * BANDS // length
             for band in range(BANDS):
@@ -104,8 +120,8 @@ def _thinned(pixels: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def take_lines(stack: NDArray, mask: NDArray[np.bool_] | None = None) -> Lines:
-    """The lines of frames, ``stack`` (F, H, W), that hold the most lit pixels, evenly spread; those in ``mask`` alone
-    count."""
+    """The lines of frames, ``stack`` (F, H, W), that hold the most lit pixels, evenly spread; those
+    in ``mask`` alone count."""
     height, width = stack.shape[1:]
     step = max(1, int(np.sqrt(height * width / _LOOKED_AT_PX)))
     coarse = np.ptp(stack[:, ::step, ::step], axis=0) >= LEAST_LIT_GREY
@@ -122,7 +138,9 @@ def take_lines(stack: NDArray, mask: NDArray[np.bool_] | None = None) -> Lines:
     return replace(lines, lit=lit if mask is None else lit & mask[lines.row, lines.column])
 
 
-def lines_at(frames: Sequence[NDArray] | NDArray, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Lines:
+def lines_at(
+    frames: Sequence[NDArray] | NDArray, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> Lines:
     """These rows, then these columns of ``frames`` (F, H, W); all pixels count as lit."""
     height, width = frames[0].shape
     row = np.concatenate([np.repeat(rows, width), np.tile(np.arange(height), len(columns))])
@@ -130,7 +148,12 @@ def lines_at(frames: Sequence[NDArray] | NDArray, rows: NDArray[np.intp], column
     across = np.arange(len(row)) < len(rows) * width
     last = np.where(across, column == width - 1, row == height - 1)
     return Lines(
-        np.stack([frame[row, column] for frame in frames]), column, row, ~last, across, np.ones(len(row), bool)
+        np.stack([frame[row, column] for frame in frames]),
+        column,
+        row,
+        ~last,
+        across,
+        np.ones(len(row), bool),
     )
 
 
@@ -147,8 +170,9 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class FringeSet:
-    """The sinusoids of one period: ``frames`` their indices, ``shifts_rad`` (N,), ``levels`` (N, n), mean, modulation
-    and phase (n,) of the lines' pixels, and ``good`` pixels: modulated and never saturated."""
+    """The sinusoids of one period: ``frames`` their indices, ``shifts_rad`` (N,), ``levels`` (N,
+    n), mean, modulation and phase (n,) of the lines' pixels, and ``good`` pixels: modulated and
+    never saturated."""
 
     direction: Direction
     number: int
@@ -168,7 +192,9 @@ class FringeSet:
     @property
     def one_phase(self) -> bool:
         """Whether the pixels have nearly the same phase."""
-        return not self.good.any() or bool(abs(np.exp(1j * self.phase[self.good]).mean()) > ONE_PHASE)
+        return not self.good.any() or bool(
+            abs(np.exp(1j * self.phase[self.good]).mean()) > ONE_PHASE
+        )
 
 
 def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list[FringeSet]:
@@ -184,16 +210,32 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
             phase, modulation, mean = (part[0] for part in wrapped_phase(levels[:, None], shifts))
             good = lines.lit & (modulation >= MIN_MODULATION) & (levels < GREY_LEVELS).all(axis=0)
             sets.append(
-                FringeSet(direction, number, fringe.pitch_px, frames, shifts, levels, mean, phase, modulation, good)
+                FringeSet(
+                    direction,
+                    number,
+                    fringe.pitch_px,
+                    frames,
+                    shifts,
+                    levels,
+                    mean,
+                    phase,
+                    modulation,
+                    good,
+                )
             )
     return sets
 
 
 def equal_frames(
-    lines: Lines, sets: Sequence[FringeSet], rig: Rig, directions: Sequence[Direction], following: bool = False
+    lines: Lines,
+    sets: Sequence[FringeSet],
+    rig: Rig,
+    directions: Sequence[Direction],
+    following: bool = False,
 ) -> list[tuple[int, int]]:
-    """Pairs of frames that should differ and show the same, but for noise and a few percent of brightness: within a
-    set (``following``: only if they follow one another), and one after the other."""
+    """Pairs of frames that should differ and show the same, but for noise and a few percent of
+    brightness: within a set (``following``: only if they follow one another), and one after the
+    other."""
     found = []
     for one in sets:
         part = lines.at(_thinned(one.good))
@@ -207,19 +249,29 @@ def equal_frames(
     low, high = levels.min(axis=0), levels.max(axis=0)
     from_middle, span = levels - (low + high) / 2, float(np.median(high - low))
     bright, dark = ((sign * from_middle > CLEAR_LEVELS * span).mean(axis=1) for sign in (1, -1))
-    coded = [frame.index for frame in rig.sequence if frame.direction is None or frame.direction in directions]
+    coded = [
+        frame.index
+        for frame in rig.sequence
+        if frame.direction is None or frame.direction in directions
+    ]
     for i, j in pairwise(coded):
         same_set = any({i, j} <= set(one.frames) for one in sets)
         # A frame that is bright or dark all over may well be followed by another one.
         varied = all(min(bright[k], dark[k]) > 0.05 for k in (i, j))
         apart = np.abs(levels[i] - levels[j])
-        if not same_set and varied and np.median(apart) < 0.02 * span and (apart < 0.1 * span).mean() > 0.98:
+        if (
+            not same_set
+            and varied
+            and np.median(apart) < 0.02 * span
+            and (apart < 0.1 * span).mean() > 0.98
+        ):
             found.append((i, j))
     return found
 
 
 def _same(part: Lines, i: int, j: int, most: float) -> bool:
-    """Whether two frames show the same but for noise and brightness, with less than ``most`` grey levels between."""
+    """Whether two frames show the same but for noise and brightness, with less than ``most`` grey
+    levels between."""
     first, second = (part.levels[k].astype(np.float64) for k in (i, j))
     if len(first) < LEAST_PX or np.array_equal(first, second):
         return len(first) >= LEAST_PX
@@ -235,13 +287,16 @@ def _same(part: Lines, i: int, j: int, most: float) -> bool:
 
 
 def turns(lines: Lines, index: int) -> float:
-    """How often a frame turns from bright to dark or back along a line, in the mean over rows or columns, whichever
-    has more."""
+    """How often a frame turns from bright to dark or back along a line, in the mean over rows or
+    columns, whichever has more."""
     low, high = lines.levels.min(axis=0).astype(np.float64), lines.levels.max(axis=0)
     bright = lines.levels[index] > (low + high) / 2
     turned = np.append((bright[1:] != bright[:-1]) & lines.joined[:-1], False)
     ends = ~lines.joined
-    return max(float(turned[kind].sum() / max(1, ends[kind].sum())) for kind in (lines.across, ~lines.across))
+    return max(
+        float(turned[kind].sum() / max(1, ends[kind].sum()))
+        for kind in (lines.across, ~lines.across)
+    )
 
 
 def _trimmed(values: NDArray) -> float:
@@ -250,9 +305,9 @@ def _trimmed(values: NDArray) -> float:
 
 
 def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
-    """Of four steps and more: the position of the step whose shift is farthest from the rig file's, and by how many rad
-    (with four, all are as far). None where too little tells, and where a narrow range of phases can't tell it from
-    other faults."""
+    """Of four steps and more: the position of the step whose shift is farthest from the rig file's,
+    and by how many rad (with four, all are as far). None where too little tells, and where a narrow
+    range of phases can't tell it from other faults."""
     picked = _thinned(one.good)
     if one.steps < 4 or len(picked) < LEAST_PX:
         return None
@@ -271,7 +326,9 @@ def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
         kept = np.abs(residual) < 6 * np.median(np.abs(residual)) + 1.0
         solution = np.linalg.lstsq(terms[kept], residual[kept], rcond=None)[0] / (1 - influence[n])
         error = residual[kept] / (1 - influence[n]) - terms[kept] @ solution
-        covariance = np.linalg.inv(terms[kept].T @ terms[kept]) * error.var() * 4  # neighbours share their errors
+        covariance = (
+            np.linalg.inv(terms[kept].T @ terms[kept]) * error.var() * 4
+        )  # neighbours share their errors
         along = np.array([0, -math.sin(shift), -math.cos(shift), 0, 0])
         estimate = Estimate(float(along @ solution), float(np.sqrt(along @ covariance @ along)))
         if worst is None or abs(estimate.value) > abs(worst[1].value):
@@ -280,8 +337,9 @@ def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
 
 
 class Ripple(NamedTuple):
-    """Amplitude in rad of an error of the phase, and its part that goes with the cosine. With equal steps, what makes
-    the same of the same brightness at every pixel has a sine of N times the phase alone: its waves are symmetric."""
+    """Amplitude in rad of an error of the phase, and its part that goes with the cosine. With equal
+    steps, what makes the same of the same brightness at every pixel has a sine of N times the phase
+    alone: its waves are symmetric."""
 
     size: Estimate
     cosine: Estimate
@@ -292,19 +350,26 @@ class Ripple(NamedTuple):
 
 
 def ripples(lines: Lines, one: FringeSet) -> dict[int, Ripple]:
-    """By harmonic, the error of the phase that goes with twice and N times the phase; none where the image shows too
-    few windows of two periods and more."""
+    """By harmonic, the error of the phase that goes with twice and N times the phase; none where
+    the image shows too few windows of two periods and more."""
     slopes = []
     for across in (True, False):
         pixels = one.good & (lines.across == across)
         pairs = np.flatnonzero(pixels[:-1] & pixels[1:] & lines.joined[:-1])
         if len(pairs) >= LEAST_PX:
-            slopes.append((float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs])))), across))
+            slopes.append(
+                (
+                    float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs])))),
+                    across,
+                )
+            )
     slope, across = max(slopes, default=(0.0, True))
     period = TAU / slope if slope > 0 else math.inf
     if not SHORTEST_PERIOD_PX <= period <= LONGEST_WINDOW_PX / WINDOW_PERIODS:
         return {}
-    windows = _windows(one.good & (lines.across == across), lines.joined, math.ceil(WINDOW_PERIODS * period))
+    windows = _windows(
+        one.good & (lines.across == across), lines.joined, math.ceil(WINDOW_PERIODS * period)
+    )
     if len(windows) < FEWEST_WINDOWS:
         return {}
     phase = np.unwrap(one.phase[windows], axis=1) + one.shifts_rad[0]
@@ -316,7 +381,9 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Ripple]:
         return values - (values @ surface) @ surface.T
 
     rest = flat(phase)
-    terms = np.stack([flat(wave(h * phase)) for h in harmonics for wave in (np.cos, np.sin)], axis=-1)
+    terms = np.stack(
+        [flat(wave(h * phase)) for h in harmonics for wave in (np.cos, np.sin)], axis=-1
+    )
     size = np.sqrt((rest**2).mean(axis=1))
     kept = size <= min(3 * float(np.median(size)), 1.0)
     for _ in range(3):
@@ -332,7 +399,9 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Ripple]:
     for k, harmonic in enumerate(harmonics):
         pair = solution[2 * k : 2 * k + 2]
         sigma = float(np.sqrt(np.trace(covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]) / 2))
-        found[harmonic] = Ripple(Estimate(float(np.hypot(*pair)), sigma), Estimate(float(pair[0]), sigma))
+        found[harmonic] = Ripple(
+            Estimate(float(np.hypot(*pair)), sigma), Estimate(float(pair[0]), sigma)
+        )
     return found
 
 
@@ -351,24 +420,32 @@ def _wrapped(angle: NDArray) -> NDArray[np.float64]:
     return angle - TAU * np.rint(angle / TAU)
 
 
-def marked_saturated(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> tuple[Lines, float]:
-    """The lines with their saturated levels at `GREY_LEVELS`, and the level at which they are saturated: below that
-    where the levels of sinusoids pile up there, as in a sum of saturated exposures."""
+def marked_saturated(
+    lines: Lines, rig: Rig, directions: Sequence[Direction]
+) -> tuple[Lines, float]:
+    """The lines with their saturated levels at `GREY_LEVELS`, and the level at which they are
+    saturated: below that where the levels of sinusoids pile up there, as in a sum of saturated
+    exposures."""
     sinusoids = [index for one in fringe_sets(lines, rig, directions) for index in one.frames]
     levels = lines.levels[sinusoids][:, lines.lit]
     top = levels.max() if levels.size else GREY_LEVELS
     near = levels > top - PILE_DEPTH * (top - levels.min()) if levels.size else levels
     piled = np.count_nonzero(levels == top)
-    if top >= GREY_LEVELS or piled < PILED_SHARE * levels.size or piled < np.count_nonzero(near) / 2:
+    if (
+        top >= GREY_LEVELS
+        or piled < PILED_SHARE * levels.size
+        or piled < np.count_nonzero(near) / 2
+    ):
         return lines, float(GREY_LEVELS)
-    return replace(lines, levels=np.where(lines.levels >= top, levels.dtype.type(GREY_LEVELS), lines.levels)), float(
-        top
-    )
+    return replace(
+        lines, levels=np.where(lines.levels >= top, levels.dtype.type(GREY_LEVELS), lines.levels)
+    ), float(top)
 
 
 class Edges(NamedTuple):
-    """At the edges of Gray cells: the common ``offset_turns`` of the phase there, the share of edges within an eighth
-    of a period of it (``agreeing``), the share at which phase and cells grow the same way, and how many."""
+    """At the edges of Gray cells: the common ``offset_turns`` of the phase there, the share of
+    edges within an eighth of a period of it (``agreeing``), the share at which phase and cells grow
+    the same way, and how many."""
 
     offset_turns: Estimate
     agreeing: float
@@ -382,11 +459,15 @@ class Edges(NamedTuple):
 
 
 def gray_edges(lines: Lines, one: FringeSet, rig: Rig, limits: Limits) -> Edges | None:
-    """What the edges of the Gray cells say about the phase of the set; None without Gray code or with few edges."""
+    """What the edges of the Gray cells say about the phase of the set; None without Gray code or
+    with few edges."""
     code = rig.code(one.direction)
     if not isinstance(code, PhaseShift) or code.gray is None or one.number != code.finest:
         return None
-    length, levels = rig.pattern_length(one.direction), lines.levels[list(rig.sequence.gray(one.direction))]
+    length, levels = (
+        rig.pattern_length(one.direction),
+        lines.levels[list(rig.sequence.gray(one.direction))],
+    )
     cells = code.gray.cells_of(levels, one.mean, one.modulation, limits.ambiguous_fraction)
     usable = one.good & cells.trusted
     first = np.flatnonzero(usable[:-1] & usable[1:] & lines.joined[:-1])
@@ -395,9 +476,12 @@ def gray_edges(lines: Lines, one: FringeSet, rig: Rig, limits: Limits) -> Edges 
     kept = np.abs(step) < TAU / 4
     first, step = first[kept], step[kept]
     edge_px = (
-        code.gray.centre_px(cells.number[first], length) + code.gray.centre_px(cells.number[first + 1], length)
+        code.gray.centre_px(cells.number[first], length)
+        + code.gray.centre_px(cells.number[first + 1], length)
     ) / 2
-    offset = _wrapped(one.phase[first] + step / 2 - TAU * (edge_px - code.origin_px) / code.pitch_px)
+    offset = _wrapped(
+        one.phase[first] + step / 2 - TAU * (edge_px - code.origin_px) / code.pitch_px
+    )
     known = np.isfinite(offset)
     if known.sum() < 40:
         return None

@@ -1,1 +1,2 @@
-"""The rig and what it projects: pinholes with lens distortion, calibration files, patterns, frame order."""
+"""The rig and what it projects: pinholes with lens distortion, calibration files, patterns, frame
+order."""

@@ -1,11 +1,12 @@
 """Calibrations of a camera and a projector in OpenCV's files (FileStorage: XML, YAML, JSON).
 
-Tools name the same numbers differently; these names are read: OpenCV's stereo samples (M1, D1, M2, D2 or cameraMatrix1,
-distCoeffs1, ..., R, T), procamcalib and scan3d-capture (cam_K, cam_kc, proj_K, proj_kc, R, T) and SLStudio (Kc, kc, Kp,
-kp, Rp, Tp). In all of them a point goes from the camera's frame to the projector's by ``X_p = R X_c + T``.
+Tools name the same numbers differently; these names are read: OpenCV's stereo samples (M1, D1, M2,
+D2 or cameraMatrix1, distCoeffs1, ..., R, T), procamcalib and scan3d-capture (cam_K, cam_kc, proj_K,
+proj_kc, R, T) and SLStudio (Kc, kc, Kp, kp, Rp, Tp). In all of them a point goes from the camera's
+frame to the projector's by ``X_p = R X_c + T``.
 
-On damaged files OpenCV's reader writes outside its memory (OpenCV 5.0: a few thousand random changes of a file end the
-process), so it runs in the process of `fpp_ml_bench.containers`.
+On damaged files OpenCV's reader writes outside its memory (OpenCV 5.0: a few thousand random
+changes of a file end the process), so it runs in the process of `fpp_ml_bench.containers`.
 """
 
 from collections.abc import Iterable
@@ -29,11 +30,13 @@ UNITS = {"mm": MM_PER_M, "m": 1.0}
 SUFFIXES = (".xml", ".yaml", ".yml", ".json")
 LARGEST_BYTES = 1 << 24
 _LONGEST_YAML = 1 << 18
-"""Characters that are looked at for the cause where OpenCV can't read a file: parsing YAML in Python is slow."""
+"""Characters that are looked at for the cause where OpenCV can't read a file: parsing YAML in
+Python is slow."""
 ROUNDED = 1e-5
 """Largest accepted |R R^T - I|: a rotation that was rounded to float32 or to six digits."""
 EXACT = 1e-14
-"""A rotation closer than this is taken as it is, so that writing and reading gives the same numbers."""
+"""A rotation closer than this is taken as it is, so that writing and reading gives the same
+numbers."""
 
 _NAMES = {
     "camera matrix": ("M1", "cameraMatrix1", "cam_K", "Cam_K", "Kc"),
@@ -44,18 +47,23 @@ _NAMES = {
     "translation": ("T", "Tp"),
 }
 _CURE = (
-    "give the numbers in the rig file's own entries (camera, projector, rotation, translation_m), or write the file by "
+    "give the numbers in the rig file's own entries (camera, projector, rotation, translation_m), "
+    "or write the file by "
     "cv2.FileStorage"
 )
 _SIZES = {"camera": ("imageSize1", "imageSize"), "projector": ("imageSize2",)}
-_WIDTH_AND_HEIGHT = {"camera": ("frameWidth", "frameHeight"), "projector": ("screenResX", "screenResY")}
+_WIDTH_AND_HEIGHT = {
+    "camera": ("frameWidth", "frameHeight"),
+    "projector": ("screenResX", "screenResY"),
+}
 _ERRORS = ("cam_error", "proj_error", "stereo_error")
 
 
 @dataclass(frozen=True)
 class OpenCvCalibration:
-    """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``. ``errors_px``: the
-    reprojection errors of camera, projector and both that the calibrating tool reported, None where it did not."""
+    """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``.
+    ``errors_px``: the reprojection errors of camera, projector and both that the calibrating tool
+    reported, None where it did not."""
 
     camera: Pinhole
     projector: Pinhole
@@ -71,15 +79,22 @@ def read_opencv_calibration(
     projector_size: tuple[int, int] | None = None,
     unit: str = "mm",
 ) -> OpenCvCalibration:
-    """The calibration in a file. ``camera_size`` and ``projector_size``: (width, height) in px, needed where the file
-    does not store them; ``unit``: mm or m, of its translation. A rotation rounded to float32 becomes the nearest exact
-    one. Raises `RigError` naming the file for anything missing, of a wrong shape, not finite, or impossible."""
+    """The calibration in a file. ``camera_size`` and ``projector_size``: (width, height) in px,
+    needed where the file does not store them; ``unit``: mm or m, of its translation. A rotation
+    rounded to float32 becomes the nearest exact one. Raises `RigError` naming the file for anything
+    missing, of a wrong shape, not finite, or impossible."""
     require(unit in UNITS, f"unit: expected {' or '.join(UNITS)}, got {unit!r}")
     nodes = _nodes(Path(path))
-    require(any(name in nodes for names in _NAMES.values() for name in names), f"{path}: {_other_layout(nodes)}")
+    require(
+        any(name in nodes for names in _NAMES.values() for name in names),
+        f"{path}: {_other_layout(nodes)}",
+    )
     try:
         translation = _matrix(nodes, "translation", (3, 1), (1, 3)).ravel()
-        require(np.any(translation), "the translation is zero, so no depth can be triangulated; calibrate again")
+        require(
+            np.any(translation),
+            "the translation is zero, so no depth can be triangulated; calibrate again",
+        )
         return OpenCvCalibration(
             _device(nodes, "camera", camera_size),
             _device(nodes, "projector", projector_size),
@@ -91,18 +106,25 @@ def read_opencv_calibration(
         raise RigError(f"{path}: {error}") from error
 
 
-def write_opencv_calibration(calibration: OpenCvCalibration, path: str | Path, unit: str = "mm") -> None:
-    """Write a calibration as XML, YAML or JSON (by the suffix) with the names of OpenCV's stereo samples (M1, D1, M2,
-    D2, R, T), sizes as imageSize1 and imageSize2 and errors as cam_error, proj_error and stereo_error. Reading it gives
-    equal numbers; only a translation that is no number of mm by 1000 changes, by its last bit, where ``unit`` is mm.
-    Raises `RigError` for another suffix or unit, or when the file can't be written."""
+def write_opencv_calibration(
+    calibration: OpenCvCalibration, path: str | Path, unit: str = "mm"
+) -> None:
+    """Write a calibration as XML, YAML or JSON (by the suffix) with the names of OpenCV's stereo
+    samples (M1, D1, M2, D2, R, T), sizes as imageSize1 and imageSize2 and errors as cam_error,
+    proj_error and stereo_error. Reading it gives equal numbers; only a translation that is no
+    number of mm by 1000 changes, by its last bit, where ``unit`` is mm. Raises `RigError` for
+    another suffix or unit, or when the file can't be written."""
     import cv2
 
     file = Path(path)
     require(unit in UNITS, f"unit: expected {' or '.join(UNITS)}, got {unit!r}")
-    require(file.suffix.lower() in SUFFIXES, f"{file}: expected a file ending in {', '.join(SUFFIXES)}")
+    require(
+        file.suffix.lower() in SUFFIXES, f"{file}: expected a file ending in {', '.join(SUFFIXES)}"
+    )
     storage = cv2.FileStorage()
-    storage.open(f"calibration{file.suffix.lower()}", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.open(
+        f"calibration{file.suffix.lower()}", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY
+    )
     for number, device in enumerate((calibration.camera, calibration.projector), 1):
         matrix = [[device.fx, 0.0, device.cx], [0.0, device.fy, device.cy], [0.0, 0.0, 1.0]]
         storage.write(f"M{number}", np.array(matrix))
@@ -126,7 +148,12 @@ def _in_unit(length_m: float, per_metre: float) -> float:
     """The number that, read again, gives ``length_m`` to the last bit, where there is one."""
     near = length_m * per_metre
     return next(
-        (n for n in (near, np.nextafter(near, -np.inf), np.nextafter(near, np.inf)) if n / per_metre == length_m), near
+        (
+            n
+            for n in (near, np.nextafter(near, -np.inf), np.nextafter(near, np.inf))
+            if n / per_metre == length_m
+        ),
+        near,
     )
 
 
@@ -134,13 +161,17 @@ def _device(nodes: dict[str, Any], name: str, given: tuple[int, int] | None) -> 
     matrix = _matrix(nodes, f"{name} matrix", (3, 3))
     (fx, skew, cx), (zero, fy, cy), last = matrix.tolist()
     upper = skew == zero == 0.0 and last == [0.0, 0.0, 1.0]
-    require(upper, f"{name} matrix: expected fx 0 cx, 0 fy cy, 0 0 1 (no skew), found {matrix.tolist()}")
+    require(
+        upper, f"{name} matrix: expected fx 0 cx, 0 fy cy, 0 0 1 (no skew), found {matrix.tolist()}"
+    )
     distortion = _matrix(nodes, f"{name}'s distortion", None).ravel()
     width, height = _size(nodes, name, given)
     try:
         return Pinhole(width, height, fx, fy, cx, cy, tuple(distortion.tolist()))
     except RigError as error:
-        raise RigError(f"{name}: {error}; a calibration in px with OpenCV's lens model is needed") from error
+        raise RigError(
+            f"{name}: {error}; a calibration in px with OpenCV's lens model is needed"
+        ) from error
 
 
 def _size(nodes: dict[str, Any], name: str, given: tuple[int, int] | None) -> tuple[int, int]:
@@ -152,14 +183,26 @@ def _size(nodes: dict[str, Any], name: str, given: tuple[int, int] | None) -> tu
     stored = np.ravel(stored["data"]).tolist() if isinstance(stored, dict) else stored
     names = ", ".join((*_SIZES[name], " with ".join(pair)))
     if stored is None:
-        missing = f"the size of the {name} is not stored ({names}); give {name}_size=(width, height) in px"
+        missing = (
+            f"the size of the {name} is not stored ({names}); give {name}_size=(width, height) in "
+            f"px"
+        )
         require(given is not None, missing)
         return given  # type: ignore[return-value]
-    whole = isinstance(stored, list) and len(stored) == 2 and all(isinstance(n, int | float) for n in stored)
+    whole = (
+        isinstance(stored, list)
+        and len(stored) == 2
+        and all(isinstance(n, int | float) for n in stored)
+    )
     whole = whole and all(np.isfinite(n) and n == int(n) for n in stored)
-    require(whole, f"size of the {name}: expected width and height in px ({names}), found {stored!r}")
+    require(
+        whole, f"size of the {name}: expected width and height in px ({names}), found {stored!r}"
+    )
     width, height = (int(n) for n in stored)
-    other = f"{name}_size is given as {given}, but the file says {(width, height)}; give the size of the calibration"
+    other = (
+        f"{name}_size is given as {given}, but the file says {(width, height)}; give the size of "
+        f"the calibration"
+    )
     require(given is None or tuple(given) == (width, height), other)
     return width, height
 
@@ -168,7 +211,10 @@ def _rotation(matrix: NDArray[np.float64]) -> Matrix3:
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     wrong = f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be {ROUNDED:g}"
     require(error <= ROUNDED, f"{wrong}; write more digits, or calibrate again")
-    require(np.linalg.det(matrix) > 0, "rotation: determinant is -1, a mirror image; check the sign of one axis")
+    require(
+        np.linalg.det(matrix) > 0,
+        "rotation: determinant is -1, a mirror image; check the sign of one axis",
+    )
     if error > EXACT:
         left, _, right = np.linalg.svd(matrix)
         matrix = left @ right
@@ -178,17 +224,25 @@ def _rotation(matrix: NDArray[np.float64]) -> Matrix3:
 def _error(nodes: dict[str, Any], name: str) -> float | None:
     value = nodes.get(name)
     number = value is None or (isinstance(value, int | float) and np.isfinite(value) and value >= 0)
-    require(number, f"{name}: expected a reprojection error in px, found {value!r}; remove it if it is not known")
+    require(
+        number,
+        f"{name}: expected a reprojection error in px, found {value!r}; remove it if it is not "
+        f"known",
+    )
     return None if value is None else float(value)
 
 
-def _matrix(nodes: dict[str, Any], what: str, *shapes: tuple[int, int] | None) -> NDArray[np.float64]:
-    """The finite matrix of one of ``shapes``, or any vector for None, that the nodes hold under one of its names."""
+def _matrix(
+    nodes: dict[str, Any], what: str, *shapes: tuple[int, int] | None
+) -> NDArray[np.float64]:
+    """The finite matrix of one of ``shapes``, or any vector for None, that the nodes hold under one
+    of its names."""
     names = [name for name in _NAMES[what] if name in nodes]
     expected = f"{what}: expected a node {' or '.join(_NAMES[what])}"
     require(
         names,
-        f"{expected}, found {printable(', '.join(nodes)) or 'no nodes'}; if the file is of another tool, {_CURE}",
+        f"{expected}, found {printable(', '.join(nodes)) or 'no nodes'}; if the file is of another "
+        f"tool, {_CURE}",
     )
     require(len(names) == 1, f"{expected}, found {' and '.join(names)}; keep one of them")
     node = nodes[names[0]]
@@ -196,16 +250,26 @@ def _matrix(nodes: dict[str, Any], what: str, *shapes: tuple[int, int] | None) -
     require(isinstance(node, dict), no_matrix)
     values = np.array(node["data"], dtype=np.float64).reshape(node["shape"])
     if shapes == (None,):
-        require(values.size == max(values.shape), f"{names[0]} ({what}): expected a vector, found shape {values.shape}")
+        require(
+            values.size == max(values.shape),
+            f"{names[0]} ({what}): expected a vector, found shape {values.shape}",
+        )
     else:
         sizes = " or ".join(f"{rows} x {columns}" for rows, columns in filter(None, shapes))
-        require(values.shape in shapes, f"{names[0]} ({what}): expected {sizes} numbers, found shape {values.shape}")
-    require(np.isfinite(values).all(), f"{names[0]} ({what}): expected finite numbers, found {values.tolist()}")
+        require(
+            values.shape in shapes,
+            f"{names[0]} ({what}): expected {sizes} numbers, found shape {values.shape}",
+        )
+    require(
+        np.isfinite(values).all(),
+        f"{names[0]} ({what}): expected finite numbers, found {values.tolist()}",
+    )
     return values
 
 
 def _nodes(path: Path) -> dict[str, Any]:
-    """The file's top nodes: matrices as shape and data, sequences as lists, numbers and text as they are."""
+    """The file's top nodes: matrices as shape and data, sequences as lists, numbers and text as
+    they are."""
     cure = "give a calibration that OpenCV's FileStorage wrote (XML, YAML or JSON)"
     content = file_content(path, LARGEST_BYTES, RigError, cure)
     require(content, f"{path}: the file is empty; {cure}")
@@ -246,12 +310,17 @@ def _read_nodes(content: bytes, largest: int) -> Answer:
     def value(node: Any) -> Any:
         if node.isMap():
             keys = node.keys()
-            if not {"rows", "cols", "data"} <= set(keys):  # well-formed, and no matrix: of another tool
+            if not {"rows", "cols", "data"} <= set(
+                keys
+            ):  # well-formed, and no matrix: of another tool
                 return f"a mapping with the keys {', '.join(keys)}"
             if "dt" not in keys:  # written by other tools
                 shape = [int(node.getNode(name).real()) for name in ("rows", "cols")]
                 data = np.array(value(node.getNode("data")), dtype=np.float64)
-                return {"shape": shape if data.size == shape[0] * shape[1] else data.shape, "data": data.tolist()}
+                return {
+                    "shape": shape if data.size == shape[0] * shape[1] else data.shape,
+                    "data": data.tolist(),
+                }
             matrix = node.mat()
             matrix = np.zeros((0, 0)) if matrix is None else np.asarray(matrix, dtype=np.float64)
             return {"shape": matrix.shape, "data": matrix.ravel().tolist()}
@@ -273,4 +342,6 @@ def _read_nodes(content: bytes, largest: int) -> Answer:
             raise PredictionError(
                 f"node {name} is incomplete, or its numbers do not fill its rows and columns"
             ) from None
-        raise PredictionError(" ".join(str(error).partition("error: ")[2].split()) or "it can't be parsed") from None
+        raise PredictionError(
+            " ".join(str(error).partition("error: ")[2].split()) or "it can't be parsed"
+        ) from None

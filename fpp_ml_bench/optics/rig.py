@@ -1,7 +1,7 @@
 """The rig: camera and projector as pinholes with lens distortion, and the pose between them.
 
-OpenCV's conventions: the camera frame has x right, y down, z forward; a point goes from the camera's frame to the
-projector's by ``X_p = R X_c + t`` in metres.
+OpenCV's conventions: the camera frame has x right, y down, z forward; a point goes from the
+camera's frame to the projector's by ``X_p = R X_c + t`` in metres.
 """
 
 import math
@@ -40,13 +40,15 @@ Matrix3 = tuple[tuple[float, float, float], ...]
 class Rig:
     """Camera, projector, the pose between them, and the sequence that is projected.
 
-    ``rotation`` (three rows) and ``translation_m`` are kept as tuples, so that a rig is hashable and compares by value;
-    `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the horizontal fringes along the projector's
-    rows, ``pitch_vertical_px`` that of the vertical ones along its columns; with a `CodedSequence` they are its finest
-    periods, None for a direction without. ``background_m`` is the distance of a plane behind everything, None where
-    none is known. ``calibration_px`` is the RMS error in projector px that the calibration is known to have, 0 where it
-    is not known; it goes into stated uncertainties, and two rigs may be equal without it. Raises `RigError` for a pose
-    that is no rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit."""
+    ``rotation`` (three rows) and ``translation_m`` are kept as tuples, so that a rig is hashable
+    and compares by value; `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the
+    horizontal fringes along the projector's rows, ``pitch_vertical_px`` that of the vertical ones
+    along its columns; with a `CodedSequence` they are its finest periods, None for a direction
+    without. ``background_m`` is the distance of a plane behind everything, None where none is
+    known. ``calibration_px`` is the RMS error in projector px that the calibration is known to
+    have, 0 where it is not known; it goes into stated uncertainties, and two rigs may be equal
+    without it. Raises `RigError` for a pose that is no rotation, a zero baseline, an impossible
+    range, a pitch or code that doesn't fit."""
 
     camera: Pinhole
     projector: Pinhole
@@ -66,7 +68,9 @@ class Rig:
         if isinstance(self.rotation, str | dict) or not isinstance(self.rotation, Iterable):
             raise RigError(f"rotation: expected three rows of three numbers, got {self.rotation!r}")
         rows = tuple(numbers(row, 3, f"rotation[{i}]") for i, row in enumerate(self.rotation))
-        require(len(rows) == 3, f"rotation: expected three rows of three numbers, got {len(rows)} rows")
+        require(
+            len(rows) == 3, f"rotation: expected three rows of three numbers, got {len(rows)} rows"
+        )
         settings: dict[str, Any] = {"rotation": rows, "R": np.array(rows)}
         for name, count in (("translation_m", 3), ("working_range_mm", 2)):
             settings[name] = numbers(getattr(self, name), count, name)
@@ -81,7 +85,10 @@ class Rig:
         for name in positive:
             settings[name] = number(getattr(self, name), name, positive=True)
         settings["calibration_px"] = number(self.calibration_px, "calibration_px")
-        require(settings["calibration_px"] >= 0, f"calibration_px: expected 0 or more, got {self.calibration_px:g}")
+        require(
+            settings["calibration_px"] >= 0,
+            f"calibration_px: expected 0 or more, got {self.calibration_px:g}",
+        )
         settings["t"] = np.array(settings["translation_m"])
         for name, value in settings.items():
             object.__setattr__(self, name, value)
@@ -100,17 +107,30 @@ class Rig:
         error = float(np.abs(self.R @ self.R.T - np.eye(3)).max())
         require(
             error <= ROTATION_TOLERANCE,
-            f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be {ROTATION_TOLERANCE:g}; "
+            f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be "
+            f"{ROTATION_TOLERANCE:g}; "
             "write more digits or give a rotation vector",
         )
-        require(np.linalg.det(self.R) >= 0, "rotation: determinant is -1, a mirror image; check the sign of one axis")
-        require(np.any(self.t), "translation_m: the baseline is zero, so no depth can be triangulated")
+        require(
+            np.linalg.det(self.R) >= 0,
+            "rotation: determinant is -1, a mirror image; check the sign of one axis",
+        )
+        require(
+            np.any(self.t), "translation_m: the baseline is zero, so no depth can be triangulated"
+        )
         near, far = self.working_range_mm
-        require(0 < near < far, f"working_range_mm: expected 0 < near < far, got {near:g} to {far:g} mm")
-        outside = f"standoff_m: {self.standoff_m:g} m is outside the working range {near:g} to {far:g} mm"
+        require(
+            0 < near < far, f"working_range_mm: expected 0 < near < far, got {near:g} to {far:g} mm"
+        )
+        outside = (
+            f"standoff_m: {self.standoff_m:g} m is outside the working range {near:g} to {far:g} mm"
+        )
         require(near <= self.standoff_m * MM_PER_M <= far, outside)
         if self.background_m is not None:
-            inside = f"background_m: {self.background_m:g} m must lie beyond the working range, ending at {far:g} mm"
+            inside = (
+                f"background_m: {self.background_m:g} m must lie beyond the working range, ending "
+                f"at {far:g} mm"
+            )
             require(self.background_m * MM_PER_M > far, inside)
 
     def _check_code(self, direction: Direction) -> None:
@@ -121,12 +141,16 @@ class Rig:
                 raise RigError(f"sequence.{direction}.{error}") from error
             return
         pitch, length = self.pitch(direction), self.pattern_length(direction)
-        fits = f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} to {length} px (the pattern), got {pitch:g} px"
+        fits = (
+            f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} to {length} px (the pattern), "
+            f"got {pitch:g} px"
+        )
         require(SMALLEST_PITCH_PX <= pitch <= length, fits)
         bits, needed = self.sequence.bits(direction), bits_needed(length, pitch)
         require(
             bits >= needed,
-            f"sequence.bits_{direction}: {length} px hold {cell_count(length, pitch)} Gray cells of half a period "
+            f"sequence.bits_{direction}: {length} px hold {cell_count(length, pitch)} Gray cells "
+            f"of half a period "
             f"({pitch / 2:g} px), which need {needed} bits, got {bits}",
         )
 
@@ -143,14 +167,21 @@ class Rig:
     @property
     def fringe_directions(self) -> tuple[Direction, ...]:
         """Those of `directions` that have sinusoids."""
-        return tuple(direction for direction in self.directions if self._pitch(direction) is not None)
+        return tuple(
+            direction for direction in self.directions if self._pitch(direction) is not None
+        )
 
     def pitch(self, direction: Direction) -> float:
-        """Period of the finest fringes in projector px. Raises `RigError` for a direction without fringes."""
+        """Period of the finest fringes in projector px. Raises `RigError` for a direction without
+        fringes."""
         pitch = self._pitch(direction)
         if pitch is None:
             listed = " and ".join(self.fringe_directions)
-            alone = "crossed fringes alone" if not self.directions else "Gray code alone, and no fringes"
+            alone = (
+                "crossed fringes alone"
+                if not self.directions
+                else "Gray code alone, and no fringes"
+            )
             projected = f"{listed} fringes, and no {direction} ones" if listed else alone
             raise RigError(f"this rig projects {projected}")
         return pitch
@@ -160,7 +191,8 @@ class Rig:
         """``background_m`` where one is known. Raises `RigError` where none is."""
         require(
             self.background_m is not None,
-            "background_m: missing in this rig; give the distance of the plane behind the objects in m",
+            "background_m: missing in this rig; give the distance of the plane behind the objects "
+            "in m",
         )
         return float(self.background_m or 0.0)
 
@@ -169,7 +201,8 @@ class Rig:
         """The sequence of a rig of the paper's kind. Raises `RigError` for any other."""
         if not isinstance(self.sequence, Sequence):
             raise RigError(
-                "sequence: this needs the paper's kind (steps, bits_horizontal, bits_vertical), and the rig has a code "
+                "sequence: this needs the paper's kind (steps, bits_horizontal, bits_vertical), "
+                "and the rig has a code "
                 "of its own for each direction"
             )
         return self.sequence
@@ -182,8 +215,9 @@ class Rig:
         return self.sequence.code(direction, self._pitch(direction) or PAPER_PITCH_PX)
 
     def shifts_rad(self, direction: Direction) -> tuple[float, ...]:
-        """Phase shifts of the finest fringes of a direction, frame by frame, so that frame n shows ``cos(2 pi w / P +
-        shift_n)`` along the projector coordinate w. Raises `RigError` for a direction without fringes."""
+        """Phase shifts of the finest fringes of a direction, frame by frame, so that frame n shows
+        ``cos(2 pi w / P + shift_n)`` along the projector coordinate w. Raises `RigError` for a
+        direction without fringes."""
         pitch = self.pitch(direction)
         if isinstance(self.sequence, Sequence):
             steps = self.sequence.steps
@@ -195,7 +229,8 @@ class Rig:
         return tuple((2 * np.pi * turns).tolist())
 
     def pattern_length(self, direction: Direction) -> int:
-        """Projector px along which the fringes vary: the rows for horizontal, the columns for vertical ones."""
+        """Projector px along which the fringes vary: the rows for horizontal, the columns for
+        vertical ones."""
         return self.projector.height if direction == "horizontal" else self.projector.width
 
     @property
@@ -210,15 +245,20 @@ class Rig:
         return (far_mm - near_mm) / 2
 
     def with_range(self, range_mm: tuple[float, float]) -> "Rig":
-        """The rig with another working range, its standoff in the range's middle, and no known background."""
-        return replace(self, working_range_mm=range_mm, standoff_m=middle_m(range_mm), background_m=None)
+        """The rig with another working range, its standoff in the range's middle, and no known
+        background."""
+        return replace(
+            self, working_range_mm=range_mm, standoff_m=middle_m(range_mm), background_m=None
+        )
 
     def scaled(self, size: int) -> "Rig":
-        """The rig with a camera image ``size`` px wide; the projector, and with it the ambiguity, stays as it is."""
+        """The rig with a camera image ``size`` px wide; the projector, and with it the ambiguity,
+        stays as it is."""
         return replace(self, camera=self.camera.scaled(size))
 
     def with_crossed(self, crossed: Crossed) -> "Rig":
-        """The rig with the frames of ``crossed`` before its own; with others in place of its crossed frames."""
+        """The rig with the frames of ``crossed`` before its own; with others in place of its
+        crossed frames."""
         own = self.sequence
         if isinstance(own, CodedSequence):
             order = ("crossed", *(name for name in own.order if name != "crossed"))
@@ -228,15 +268,20 @@ class Rig:
         return replace(self, sequence=CodedSequence(horizontal, vertical, order, crossed))
 
     def project(self, points_m: ArrayLike) -> Maps:
-        """Projector pixels (u_p, v_p) of points (..., 3) in the CAMERA's frame, metres; NaN behind the projector."""
+        """Projector pixels (u_p, v_p) of points (..., 3) in the CAMERA's frame, metres; NaN behind
+        the projector."""
         points = np.asarray(points_m, dtype=np.float64)
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         # Added in this order on every processor, which a matrix product is not.
-        turned = [row[0] * x + row[1] * y + row[2] * z + shift for row, shift in zip(self.R, self.t, strict=True)]
+        turned = [
+            row[0] * x + row[1] * y + row[2] * z + shift
+            for row, shift in zip(self.R, self.t, strict=True)
+        ]
         return self.projector.project(np.stack(turned, axis=-1))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, lists and mappings, as stored with a dataset; `rig_from_dict` gives an equal rig back."""
+        """Plain numbers, lists and mappings, as stored with a dataset; `rig_from_dict` gives an
+        equal rig back."""
         content: dict[str, Any] = {
             "camera": self.camera.to_dict(),
             "projector": self.projector.to_dict(),
@@ -254,47 +299,59 @@ class Rig:
             del content["pitch_px"]
         return content
 
-    def _central_coordinate(self, direction: Direction, depth_m: ArrayLike, shift_px: float = 0.0) -> NDArray:
-        """Projector coordinate seen ``shift_px`` beside the camera's central pixel, (K,) for depths (K,)."""
+    def _central_coordinate(
+        self, direction: Direction, depth_m: ArrayLike, shift_px: float = 0.0
+    ) -> NDArray:
+        """Projector coordinate seen ``shift_px`` beside the camera's central pixel, (K,) for depths
+        (K,)."""
         centre = (self.camera.width - 1) / 2, (self.camera.height - 1) / 2
         axis = AXES.index(direction)
         pixel = [c + (shift_px if i == axis else 0.0) for i, c in enumerate(centre)]
         x, y = self.camera.normalised(*pixel)
         depth = np.atleast_1d(np.asarray(depth_m, dtype=np.float64))
         seen = self.project(np.stack([x * depth, y * depth, depth], axis=-1))[axis]
-        unseen = "the projector does not look at what the camera's central pixel sees: check rotation and signs"
+        unseen = (
+            "the projector does not look at what the camera's central pixel sees: check rotation "
+            "and signs"
+        )
         require(np.all(np.isfinite(seen)), unseen)
         return seen
 
     def in_range(self, depth_mm: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a depth in mm lies in the working range, its ends included; of the shape of ``depth_mm``. What does
-        not, NaN too, is no depth: every method that measures asks this of its final depth, without any tolerance."""
+        """Whether a depth in mm lies in the working range, its ends included; of the shape of
+        ``depth_mm``. What does not, NaN too, is no depth: every method that measures asks this of
+        its final depth, without any tolerance."""
         near, far = self.working_range_mm
         depth = np.asarray(depth_mm)
         return (depth >= near) & (depth <= far)
 
     def periods_in_range(self, direction: Direction) -> float:
-        """Fringe periods that the central camera pixel's ray crosses within the working range (2.4 and 1.9 here)."""
+        """Fringe periods that the central camera pixel's ray crosses within the working range (2.4
+        and 1.9 here)."""
         near, far = self._central_coordinate(direction, np.array(self.working_range_mm) / MM_PER_M)
         return abs(float(near - far)) / self.pitch(direction)
 
     def image_px_per_period(self, direction: Direction) -> float:
-        """Image px a fringe period covers at the image centre, on a plane square to the axis at the standoff: central
-        difference over one image px along the axis that the fringes vary; 22.56 for the paper's rig at 960 px."""
+        """Image px a fringe period covers at the image centre, on a plane square to the axis at the
+        standoff: central difference over one image px along the axis that the fringes vary; 22.56
+        for the paper's rig at 960 px."""
         return self._image_px(direction, self.pitch(direction))
 
     def projector_px_per_image_px(self, direction: Direction) -> float:
-        """Projector px that an image px covers there, along the axis that the direction's frames vary."""
+        """Projector px that an image px covers there, along the axis that the direction's frames
+        vary."""
         pitch = self._pitch(direction) or 1.0
         return pitch / self._image_px(direction, pitch)
 
     def _image_px(self, direction: Direction, projector_px: float) -> float:
-        left, right = (self._central_coordinate(direction, self.standoff_m, s)[0] for s in (-0.5, 0.5))
+        left, right = (
+            self._central_coordinate(direction, self.standoff_m, s)[0] for s in (-0.5, 0.5)
+        )
         return projector_px / change if (change := abs(float(right - left))) > 0 else math.inf
 
     def image_frequency(self, cycles_per_px: tuple[float, float]) -> tuple[float, float]:
-        """Cycles per image px along the image's columns and rows of a frequency (f_u, f_v) on the pattern, at the image
-        centre on a plane square to the axis at the standoff: a linear map."""
+        """Cycles per image px along the image's columns and rows of a frequency (f_u, f_v) on the
+        pattern, at the image centre on a plane square to the axis at the standoff: a linear map."""
         shifts = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
         beside = np.array([self.camera.width - 1, self.camera.height - 1]) / 2 + shifts
         x, y = self.camera.normalised(beside[:, 0], beside[:, 1])
@@ -303,19 +360,22 @@ class Rig:
         return float(turns[1] - turns[0]), float(turns[3] - turns[2])
 
     def image_px_of_carrier(self, cycles_per_px: tuple[float, float]) -> float:
-        """Image px that a period of crossed fringes covers, across them, as `image_px_per_period` for the direction of
-        their frequency, `Crossed.cycles_per_px`."""
+        """Image px that a period of crossed fringes covers, across them, as `image_px_per_period`
+        for the direction of their frequency, `Crossed.cycles_per_px`."""
         cycles = math.hypot(*self.image_frequency(cycles_per_px))
         return 1 / cycles if cycles > 0 else math.inf
 
     def check_sampling(self) -> None:
-        """Raise `RigError` where a fringe period covers fewer than 4 image px, naming the pitch that would do."""
+        """Raise `RigError` where a fringe period covers fewer than 4 image px, naming the pitch
+        that would do."""
         for carrier, cycles_per_px in enumerate(self.crossed.cycles_per_px if self.crossed else ()):
             seen = self.image_px_of_carrier(cycles_per_px)
             if seen < LEAST_IMAGE_PX_PER_PERIOD:
                 raise RigError(
-                    f"crossed fringes: a period of carrier {carrier + 1} covers only {seen:.2f} px of a "
-                    f"{self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger size, or "
+                    f"crossed fringes: a period of carrier {carrier + 1} covers only {seen:.2f} px "
+                    f"of a "
+                    f"{self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: "
+                    f"use a larger size, or "
                     "a larger pitch"
                 )
         for direction in self.fringe_directions:
@@ -323,8 +383,10 @@ class Rig:
             if seen < LEAST_IMAGE_PX_PER_PERIOD:
                 needed = self.pitch(direction) * LEAST_IMAGE_PX_PER_PERIOD / seen
                 raise RigError(
-                    f"{direction} fringes: a period of {self.pitch(direction):g} projector px covers only {seen:.2f} "
-                    f"px of a {self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger "
+                    f"{direction} fringes: a period of {self.pitch(direction):g} projector px "
+                    f"covers only {seen:.2f} "
+                    f"px of a {self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are "
+                    f"needed: use a larger "
                     f"size, or a pitch of at least {math.ceil(needed * 100) / 100:g} px"
                 )
 

@@ -1,10 +1,11 @@
 """The projected sequence: what each frame shows, and which frames a configuration needs.
 
-*Horizontal* fringes have horizontal stripes: they vary along the projector's rows and measure its coordinate ``v``.
-*Vertical* fringes vary along its columns, measure ``u``. The paper's order (Section 3.2) is `Sequence`: N horizontal
-sinusoids, N vertical sinusoids, horizontal Gray code, vertical Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52
-frames. Any other sequence is a `CodedSequence`: a code of `fpp_ml_bench.coding` for one direction or both, crossed
-fringes, or all of them.
+*Horizontal* fringes have horizontal stripes: they vary along the projector's rows and measure its
+coordinate ``v``. *Vertical* fringes vary along its columns, measure ``u``. The paper's order
+(Section 3.2) is `Sequence`: N horizontal sinusoids, N vertical sinusoids, horizontal Gray code,
+vertical Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52 frames. Any other sequence is a
+`CodedSequence`: a code of `fpp_ml_bench.coding` for one direction or both, crossed fringes, or all
+of them.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +28,8 @@ Direction = Literal["horizontal", "vertical"]
 
 DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
 AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
-"""The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
+"""The direction whose fringes measure the projector's u, then the direction whose fringes measure
+its v."""
 PAPER_PITCH_PX = 18.0
 """Period of the paper's fringes in projector px."""
 CODED_KEYS = ("order", "crossed", *DIRECTIONS)
@@ -36,8 +38,8 @@ CODED_KEYS = ("order", "crossed", *DIRECTIONS)
 
 @dataclass(frozen=True)
 class Frame:
-    """A projected frame: ``step`` is n of a sinusoid or a crossed frame, or the Gray bit, 0 = most significant,
-    ``inverse`` or not; ``fringe`` numbers the periods of a code with several."""
+    """A projected frame: ``step`` is n of a sinusoid or a crossed frame, or the Gray bit, 0 = most
+    significant, ``inverse`` or not; ``fringe`` numbers the periods of a code with several."""
 
     index: int
     kind: Kind
@@ -82,15 +84,16 @@ class AnySequence(ABC):
 
     @abstractmethod
     def code(self, direction: Direction, pitch_px: float = PAPER_PITCH_PX) -> Code:
-        """The code of a direction; of the paper's kind with fringes of a period of ``pitch_px``. Raises `RigError`
-        where it has none."""
+        """The code of a direction; of the paper's kind with fringes of a period of ``pitch_px``.
+        Raises `RigError` where it has none."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """The entry ``sequence`` of a rig file."""
 
     def equal_steps(self) -> list[tuple[tuple[int, ...], NDArray[np.float64]]]:
-        """Every set of sinusoids of one period in equal steps: frame indices, and shifts in turns."""
+        """Every set of sinusoids of one period in equal steps: frame indices, and shifts in
+        turns."""
         found = []
         for direction in self.directions:
             code = self.code(direction)
@@ -98,7 +101,9 @@ class AnySequence(ABC):
                 steps = len(fringe.shifts_deg)
                 for sign in (1, -1):
                     if steps >= 3 and fringe.shifts_deg == equal_shifts(steps, sign):
-                        found.append((self.period(direction, number), sign * np.arange(steps) / steps))
+                        found.append(
+                            (self.period(direction, number), sign * np.arange(steps) / steps)
+                        )
                         break
         return found
 
@@ -111,28 +116,35 @@ class AnySequence(ABC):
     def indices(self, **wanted: object) -> tuple[int, ...]:
         """Indices of the frames whose attributes are as wanted, in the order of the sequence."""
         return tuple(
-            frame.index for frame in self.frames if all(getattr(frame, name) == value for name, value in wanted.items())
+            frame.index
+            for frame in self.frames
+            if all(getattr(frame, name) == value for name, value in wanted.items())
         )
 
     def coded(self, direction: Direction) -> tuple[int, ...]:
-        """Frame indices of a direction's code, in the code's own order: sinusoids, then Gray code."""
+        """Frame indices of a direction's code, in the code's own order: sinusoids, then Gray
+        code."""
         return self.indices(direction=direction, kind="sinusoid") + self.gray(direction)
 
     def sinusoids(self, direction: Direction) -> tuple[int, ...]:
-        """Frame indices of a direction's finest sinusoids, in the order of their steps; none where it has none."""
+        """Frame indices of a direction's finest sinusoids, in the order of their steps; none where
+        it has none."""
         return self.period(direction, self._finest(direction))
 
     def period(self, direction: Direction, fringe: int) -> tuple[int, ...]:
-        """Frame indices of a direction's sinusoids of the ``fringe``-th period, in the order of their steps."""
+        """Frame indices of a direction's sinusoids of the ``fringe``-th period, in the order of
+        their steps."""
         return self.indices(direction=direction, kind="sinusoid", fringe=fringe)
 
     def gray(self, direction: Direction) -> tuple[int, ...]:
-        """Frame indices of a direction's Gray code, in the order of its frames; none where it has none."""
+        """Frame indices of a direction's Gray code, in the order of its frames; none where it has
+        none."""
         return self.indices(direction=direction, kind="gray")
 
     @property
     def crossed_frames(self) -> tuple[int, ...]:
-        """Frame indices of crossed fringes, in the order of their steps; none where the sequence has none."""
+        """Frame indices of crossed fringes, in the order of their steps; none where the sequence
+        has none."""
         return self.indices(kind="crossed")
 
     def bits(self, direction: Direction) -> int:
@@ -151,12 +163,19 @@ class AnySequence(ABC):
         return next(iter(self.indices(kind="white")), None)
 
     def config(self, name: str) -> tuple[int, ...]:
-        """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``; empty where the sequence has
-        none."""
+        """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``; empty
+        where the sequence has none."""
         horizontal, vertical = self.sinusoids("horizontal"), self.sinusoids("vertical")
         crossed = self.crossed_frames
         single = ((0,) if 0 in crossed else horizontal or vertical or crossed or (0,))[:1]
-        frames = (single, crossed, horizontal, vertical, horizontal + vertical, tuple(range(len(self))))
+        frames = (
+            single,
+            crossed,
+            horizontal,
+            vertical,
+            horizontal + vertical,
+            tuple(range(len(self))),
+        )
         if name not in CONFIGS:
             raise ValueError(f"unknown configuration {name!r}; there are {', '.join(CONFIGS)}")
         return frames[CONFIGS.index(name)]
@@ -164,15 +183,19 @@ class AnySequence(ABC):
 
 @dataclass(frozen=True)
 class Sequence(AnySequence):
-    """The paper's kind: ``steps`` sinusoids, of a period that the rig names, and ``bits`` Gray-code frames per
-    direction, black and white."""
+    """The paper's kind: ``steps`` sinusoids, of a period that the rig names, and ``bits`` Gray-code
+    frames per direction, black and white."""
 
     steps: int = 18  # type: ignore[assignment]  # a field takes the place of the property
     bits_horizontal: int = 7
     bits_vertical: int = 7
 
     def __post_init__(self) -> None:
-        for name, least, most in (("steps", 3, 1000), ("bits_horizontal", 1, 15), ("bits_vertical", 1, 15)):
+        for name, least, most in (
+            ("steps", 3, 1000),
+            ("bits_horizontal", 1, 15),
+            ("bits_vertical", 1, 15),
+        ):
             whole(getattr(self, name), f"sequence.{name}", least, most)
 
     @property
@@ -192,21 +215,29 @@ class Sequence(AnySequence):
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
         described: list[tuple[Kind, Direction | None, int]]
-        described = [("sinusoid", direction, n) for direction in DIRECTIONS for n in range(self.steps)]
-        described += [("gray", direction, bit) for direction in DIRECTIONS for bit in range(self._bits[direction])]
+        described = [
+            ("sinusoid", direction, n) for direction in DIRECTIONS for n in range(self.steps)
+        ]
+        described += [
+            ("gray", direction, bit)
+            for direction in DIRECTIONS
+            for bit in range(self._bits[direction])
+        ]
         described += [("black", None, 0), ("white", None, 0)]
         return tuple(Frame(i, *d) for i, d in enumerate(described))
 
 
 @lru_cache
 def _paper_code(steps: int, bits: int, pitch_px: float) -> PhaseShift:
-    return PhaseShift((Fringes(pitch_px, equal_shifts(steps, 1)),), 0.0, GrayCells(pitch_px / 2, bits))
+    return PhaseShift(
+        (Fringes(pitch_px, equal_shifts(steps, 1)),), 0.0, GrayCells(pitch_px / 2, bits)
+    )
 
 
 @dataclass(frozen=True)
 class CodedSequence(AnySequence):
-    """A ``horizontal`` or ``vertical`` code, or both, or ``crossed`` fringes, and the ``order`` of what is projected:
-    these, black and white."""
+    """A ``horizontal`` or ``vertical`` code, or both, or ``crossed`` fringes, and the ``order`` of
+    what is projected: these, black and white."""
 
     horizontal: Code | None
     vertical: Code | None
@@ -216,11 +247,17 @@ class CodedSequence(AnySequence):
     def __post_init__(self) -> None:
         described = (*(["crossed"] if self.crossed else []), *self.directions)
         if not described:
-            raise RigError("sequence: no direction is coded; describe horizontal, vertical, crossed or some of them")
+            raise RigError(
+                "sequence: no direction is coded; describe horizontal, vertical, crossed or some "
+                "of them"
+            )
         known = (*described, "black", "white")
         for name in self.order:
             if name not in known or self.order.count(name) > 1:
-                raise RigError(f"sequence.order: expected each of {', '.join(known)} at most once, got {self.order}")
+                raise RigError(
+                    f"sequence.order: expected each of {', '.join(known)} at most once, got "
+                    f"{self.order}"
+                )
         if self.crossed and "crossed" not in self.order:
             raise RigError("sequence.order: crossed missing, whose fringes are described")
         for direction in self.directions:
@@ -228,7 +265,10 @@ class CodedSequence(AnySequence):
             needed = (direction, *(("black", "white") if code.needs_flat else ()))
             missing = [name for name in needed if name not in self.order]
             if missing:
-                raise RigError(f"sequence.order: {', '.join(missing)} missing, which the {direction} code needs")
+                raise RigError(
+                    f"sequence.order: {', '.join(missing)} missing, which the {direction} code "
+                    f"needs"
+                )
 
     @property
     def directions(self) -> tuple[Direction, ...]:
@@ -263,11 +303,14 @@ class CodedSequence(AnySequence):
         return {"order": list(self.order), **crossed, **codes}
 
 
-SCHEMES: dict[str, type[Code]] = {scheme.scheme: scheme for scheme in (PhaseShift, GrayOnly, Composite)}
+SCHEMES: dict[str, type[Code]] = {
+    scheme.scheme: scheme for scheme in (PhaseShift, GrayOnly, Composite)
+}
 
 
 def code_from_dict(entries: Mapping[str, Any], length_px: int, where: str) -> Code:
-    """The code that a rig file's entry describes, on a pattern ``length_px`` long. Raises `RigError` naming the key."""
+    """The code that a rig file's entry describes, on a pattern ``length_px`` long. Raises
+    `RigError` naming the key."""
     if not isinstance(entries, Mapping):
         raise RigError(f"{where}: expected a mapping with the key scheme, got {entries!r}")
     scheme = entries.get("scheme")
@@ -282,15 +325,20 @@ def code_from_dict(entries: Mapping[str, Any], length_px: int, where: str) -> Co
     return code
 
 
-def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> Sequence | CodedSequence:
-    """The sequence that a rig file describes, on patterns of ``lengths_px``. Raises `RigError` naming the key."""
+def sequence_from_dict(
+    entries: object, lengths_px: Mapping[Direction, int]
+) -> Sequence | CodedSequence:
+    """The sequence that a rig file describes, on patterns of ``lengths_px``. Raises `RigError`
+    naming the key."""
     if not isinstance(entries, Mapping):
         raise RigError(f"sequence: expected a mapping, got {entries!r}")
     paper = ("steps", "bits_horizontal", "bits_vertical")
     if any(key in entries for key in CODED_KEYS):
         mapping(entries, (), "sequence", CODED_KEYS)
         codes = {
-            direction: code_from_dict(entries[direction], lengths_px[direction], f"sequence.{direction}")
+            direction: code_from_dict(
+                entries[direction], lengths_px[direction], f"sequence.{direction}"
+            )
             for direction in DIRECTIONS
             if direction in entries
         }
@@ -310,7 +358,9 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
     try:
         mapping(entries, paper, "sequence")
     except RigError as error:
-        raise RigError(f"{error}, or a code for each direction under {' and '.join(DIRECTIONS)}") from error
+        raise RigError(
+            f"{error}, or a code for each direction under {' and '.join(DIRECTIONS)}"
+        ) from error
     return Sequence(**entries)
 
 

@@ -1,7 +1,8 @@
-"""The leaderboard as a static page: ``index.html``, the data as JSON and CSV, and a page for each submission, with
-samples of the predictions that it was scored from where they are at hand.
+"""The leaderboard as a static page: ``index.html``, the data as JSON and CSV, and a page for each
+submission, with samples of the predictions that it was scored from where they are at hand.
 
-The page works from disk and from any web server and loads no other file. The same rows give the same bytes.
+The page works from disk and from any web server and loads no other file. The same rows give the
+same bytes.
 """
 
 import hashlib
@@ -16,7 +17,13 @@ from types import MappingProxyType
 from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter
-from fpp_ml_bench.errors import CaptureError, DatasetError, FppBenchError, PredictionError, SubmissionError
+from fpp_ml_bench.errors import (
+    CaptureError,
+    DatasetError,
+    FppBenchError,
+    PredictionError,
+    SubmissionError,
+)
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANKED, with_column
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.report.report_page import SampleMaps, chosen_samples, sample_maps
@@ -25,7 +32,12 @@ from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
-from fpp_ml_bench.leaderboard.columns import assumption, assumption_sentences, given_truth, learned_from
+from fpp_ml_bench.leaderboard.columns import (
+    assumption,
+    assumption_sentences,
+    given_truth,
+    learned_from,
+)
 from fpp_ml_bench.leaderboard.ranking import (
     MOST_PAIRED,
     Group,
@@ -41,14 +53,21 @@ from fpp_ml_bench.loaders.cloud import cloud_html
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import interval_text, page, signed
 
-INDEX, DATA, TABLE, SUBMISSIONS, CLOUD = "index.html", "data.json", "data.csv", "submissions", "-cloud.html"
+INDEX, DATA, TABLE, SUBMISSIONS, CLOUD = (
+    "index.html",
+    "data.json",
+    "data.csv",
+    "submissions",
+    "-cloud.html",
+)
 _HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.page"
 _OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}(-cloud)?\.html")
 NOT_SAID = "not said"
 _SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY, columns.LEARNED)
 _SHADES = 6
 _CLIP, _MARGIN = 10, 1.05
-"""An interval is drawn down to this part of its mean, and the scale goes on beyond its ends by this factor."""
+"""An interval is drawn down to this part of its mean, and the scale goes on beyond its ends by this
+factor."""
 _STEPS = (1,), (1, 3), (1, 2, 5), tuple(range(1, 10))
 SIZES = (("wide", 570, 430), ("narrow", 360, 380))
 """Class, width and height of a picture, for a window and for a phone."""
@@ -65,8 +84,8 @@ PLACES = "Median", "Worst"
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples that are shown, and the page of the first prediction as a point cloud; ``cloud`` is None where the
-    prediction has no depth, or the dataset no camera of its size."""
+    """The samples that are shown, and the page of the first prediction as a point cloud; ``cloud``
+    is None where the prediction has no depth, or the dataset no camera of its size."""
 
     shown: list[SampleMaps]
     cloud: bytes | None
@@ -78,9 +97,10 @@ def write_page(
     out: Path,
     samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> list[Path]:
-    """Write the page of ``groups`` (ranked by the key of each) and the paper's tables into folder ``out``; returns the
-    files. ``samples``: `predicted_samples` of the rows. Removes pages of submissions that are no longer ranked, and
-    nothing else. SubmissionError where a file can't be written."""
+    """Write the page of ``groups`` (ranked by the key of each) and the paper's tables into folder
+    ``out``; returns the files. ``samples``: `predicted_samples` of the rows. Removes pages of
+    submissions that are no longer ranked, and nothing else. SubmissionError where a file can't be
+    written."""
     files = page_files(groups, papers, samples)
     try:
         with exclusive(out / LOCK_FILE, out, "writing a page there", SubmissionError):
@@ -91,7 +111,9 @@ def write_page(
                 if _OWN_PAGES.fullmatch(path.name) and f"{SUBMISSIONS}/{path.name}" not in files:
                     path.unlink()
     except OSError as error:
-        raise SubmissionError(f"{printable(str(out), 500)} can't be written: {error.strerror}") from None
+        raise SubmissionError(
+            f"{printable(str(out), 500)} can't be written: {error.strerror}"
+        ) from None
     return [out / name for name in files]
 
 
@@ -100,26 +122,36 @@ def page_files(
     papers: Sequence[ReportedTable],
     samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> dict[str, bytes]:
-    """Relative name -> content of every file of the page. Tables of trivial rows alone are in the data files only."""
+    """Relative name -> content of every file of the page. Tables of trivial rows alone are in the
+    data files only."""
     data = {DATA: table_json(groups, papers), TABLE: table_csv(groups)}
     groups = more_than_trivial(groups)
     style = (_HERE / "page.css").read_text("utf-8")
     rows = [(group, row) for group in groups for row in group.rows]
     shared: dict[str, Any] = {"meaning": MEANING, "learned_from": learned_from}
     filters: dict[str, tuple[str, list[str]]] = {
-        "class": ("Class", [name for name in FRAMES_CLASSES if any(group.key.frames == name for group in groups)]),
+        "class": (
+            "Class",
+            [name for name in FRAMES_CLASSES if any(group.key.frames == name for group in groups)],
+        ),
         "track": ("Track", sorted({group.key.track for group in groups})),
-        "learned": ("Learned from", sorted({learned_from(row.entry.row) or NOT_SAID for _, row in rows})),
+        "learned": (
+            "Learned from",
+            sorted({learned_from(row.entry.row) or NOT_SAID for _, row in rows}),
+        ),
     }
     present = {row.provenance for _, row in rows}
-    others = [metric for metric in with_column(0) if not metric.role and metric.key != "overall_mae_mm"]
+    others = [
+        metric for metric in with_column(0) if not metric.role and metric.key != "overall_mae_mm"
+    ]
     index = page(
         _PACKAGE,
         "index.html",
         "FPP-ML-Bench leaderboard",
         style,
         (_HERE / "page.js").read_text("utf-8"),
-        "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures.",
+        "Ranking of single-shot fringe projection profilometry: depth error with intervals, run "
+        "time and captures.",
         **shared,
         columns=columns,
         range_key=RANGE_KEY,
@@ -133,7 +165,9 @@ def page_files(
         colours=CLASS_COLOURS,
         not_said=NOT_SAID,
         fewest=FEWEST_OBJECTS,
-        filters={name: (title, values) for name, (title, values) in filters.items() if len(values) > 1},
+        filters={
+            name: (title, values) for name, (title, values) in filters.items() if len(values) > 1
+        },
         papers=[(f"{p.title}, mm", tables.paper_table(p), p.note) for p in papers],
     )
     files = {INDEX: index} | {name: text.encode("utf-8") for name, text in data.items()}
@@ -168,7 +202,9 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
 
 def _data_words(row: Row) -> str:
     benchmark = row.dataset.known
-    return f"{row.dataset.name if benchmark is None else benchmark.title}, {row.dataset.split} split"
+    return (
+        f"{row.dataset.name if benchmark is None else benchmark.title}, {row.dataset.split} split"
+    )
 
 
 def _score_cells(row: Row) -> list[tuple[str, str, str]]:
@@ -182,21 +218,29 @@ def _score_cells(row: Row) -> list[tuple[str, str, str]]:
 
 
 def slug(entry: Entry) -> str:
-    """Name of an entry's page: letters and digits of its own name, and the start of its content's SHA-256."""
+    """Name of an entry's page: letters and digits of its own name, and the start of its content's
+    SHA-256."""
     plain = re.sub(r"[^a-z0-9]+", "-", entry.name[:60].casefold()).strip("-") or "submission"
     return f"{plain}-{hashlib.sha256(entry.row.model_dump_json().encode()).hexdigest()[:12]}"
 
 
 def _search(row: Ranked) -> str:
     """What the search field finds a row by."""
-    words = row.entry.name, row.short_name, row.entry.row.submission.method, columns.device(row.entry)
+    words = (
+        row.entry.name,
+        row.short_name,
+        row.entry.row.submission.method,
+        columns.device(row.entry),
+    )
     return " ".join(words).casefold()
 
 
-def predicted_samples(entries: Sequence[Entry], folders: Sequence[tuple[Path, DatasetFolder]]) -> dict[str, Samples]:
-    """The samples of every folder of predictions, each with its dataset, by `Row.result_sha256` of the entries that
-    were scored from it. Row files name no samples, so only results have them. Raises SubmissionError for a folder that
-    no result was scored from, and says why."""
+def predicted_samples(
+    entries: Sequence[Entry], folders: Sequence[tuple[Path, DatasetFolder]]
+) -> dict[str, Samples]:
+    """The samples of every folder of predictions, each with its dataset, by `Row.result_sha256` of
+    the entries that were scored from it. Row files name no samples, so only results have them.
+    Raises SubmissionError for a folder that no result was scored from, and says why."""
     results = [entry for entry in entries if folders and not entry.is_row_file]
     scored = {entry.row.result_sha256: read_scored(entry.path) for entry in results}
     found: dict[str, Samples] = {}
@@ -210,28 +254,38 @@ def predicted_samples(entries: Sequence[Entry], folders: Sequence[tuple[Path, Da
             except (DatasetError, PredictionError) as error:
                 why = error
         if not of_folder:
-            raise SubmissionError(f"{printable(str(folder), 500)}: no given result was scored from it ({why})")
+            raise SubmissionError(
+                f"{printable(str(folder), 500)}: no given result was scored from it ({why})"
+            )
         found |= of_folder
     return found
 
 
 def _samples(result: Result, folder: Path, dataset: DatasetFolder) -> Samples:
     chosen = chosen_samples(result.per_sample)
-    shown = list(sample_maps(result, dataset, folder, [c for c in chosen if c[0] in PLACES] or chosen[:1]))
-    if not shown or result.mode != "standard":  # no sample has an object; depths of another mode may lack an offset
+    shown = list(
+        sample_maps(result, dataset, folder, [c for c in chosen if c[0] in PLACES] or chosen[:1])
+    )
+    if (
+        not shown or result.mode != "standard"
+    ):  # no sample has an object; depths of another mode may lack an offset
         return Samples(shown, None)
     try:
         points_mm, there = camera_points(shown[0].prediction_mm, dataset.rig.camera)
     except CaptureError:
         return Samples(shown, None)
     return Samples(
-        shown, cloud_html(f"{result.submission.name}: {shown[0].row.sample}", points_mm, shown[0].fringe[there])
+        shown,
+        cloud_html(
+            f"{result.submission.name}: {shown[0].row.sample}", points_mm, shown[0].fringe[there]
+        ),
     )
 
 
 def blocks(groups: Sequence[Group]) -> list[dict[str, Any]]:
-    """What the template needs of each dataset: its title and a ``short`` one, whether it is ``main`` (the first, or
-    not `GroupKey.special_data`), the pictures of all its rows, and its tables."""
+    """What the template needs of each dataset: its title and a ``short`` one, whether it is
+    ``main`` (the first, or not `GroupKey.special_data`), the pictures of all its rows, and its
+    tables."""
     datasets: list[dict[str, Any]] = []
     for data, members in groupby(groups, key=lambda group: group.key.data_title):
         of_data = list(members)
@@ -256,7 +310,8 @@ def blocks(groups: Sequence[Group]) -> list[dict[str, Any]]:
 
 
 def of_one_target(groups: Sequence[Group]) -> list[Group]:
-    """The groups whose errors a picture may join: those against exact depth, all where there is none."""
+    """The groups whose errors a picture may join: those against exact depth, all where there is
+    none."""
     exact = [group for group in groups if group.key.target == "depth_exact"]
     return exact or list(groups)
 
@@ -269,10 +324,13 @@ def anchor(group: Group) -> str:
 
 
 def _link(group: Group, of_data: Sequence[Group]) -> str:
-    """What is said of a table where it is one of those of its dataset: in which it differs from the others."""
+    """What is said of a table where it is one of those of its dataset: in which it differs from the
+    others."""
     parts = [group.key.frames.partition(",")[0]]
     parts += [group.key.track] if len({other.key.track for other in of_data}) > 1 else []
-    parts += [group.key.against.split()[0]] if len({other.key.target for other in of_data}) > 1 else []
+    parts += (
+        [group.key.against.split()[0]] if len({other.key.target for other in of_data}) > 1 else []
+    )
     return ", ".join(parts)
 
 
@@ -281,13 +339,16 @@ def _section(group: Group, link: str) -> dict[str, Any]:
     key = group.key
     per_object = [row.object_means(group.sort) for row in group.rows[:MOST_PAIRED]]
     objects = sorted({name for errors in per_object for name in errors})
-    machines = sorted({columns.device(row.entry) for row in group.rows if row.entry.latency_ms is not None})
+    machines = sorted(
+        {columns.device(row.entry) for row in group.rows if row.entry.latency_ms is not None}
+    )
     letters = [ascii_lowercase[number % 26] * (1 + number // 26) for number in range(len(machines))]
     scale = LogScale.of(group.rows)
     logs = [math.log(error) for errors in per_object for error in errors.values() if error]
     low, high = min(logs, default=0.0), max(logs, default=0.0)
     object_cells = [
-        [(errors.get(name), _shade(errors.get(name), low, high)) for name in objects] for errors in per_object
+        [(errors.get(name), _shade(errors.get(name), low, high)) for name in objects]
+        for errors in per_object
     ]
     return {
         "group": group,
@@ -295,7 +356,9 @@ def _section(group: Group, link: str) -> dict[str, Any]:
         "link": link,
         "machines": dict(zip(machines, letters if len(machines) > 1 else [""], strict=False)),
         "scale": scale,
-        "clipped": any((row.interval(group.sort) or (scale.low,))[0] < scale.low for row in group.rows),
+        "clipped": any(
+            (row.interval(group.sort) or (scale.low,))[0] < scale.low for row in group.rows
+        ),
         "objects": objects,
         "object_cells": object_cells,
         "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{key.rules}",
@@ -307,7 +370,8 @@ def _section(group: Group, link: str) -> dict[str, Any]:
 
 
 def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]:
-    """For each ranked row and each of them: this row minus that in mm, interval and p value, and a verdict."""
+    """For each ranked row and each of them: this row minus that in mm, interval and p value, and a
+    verdict."""
     names = [row.short_name for row in group.ranked]
     cells: dict[tuple[str, str], tuple[str, str, str]] = {}
     for pair in group.pairs:
@@ -324,7 +388,8 @@ def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]
 
 
 def _shade(error: float | None, low: float, high: float) -> int | None:
-    """The larger the error among those of a table, whose logarithms are ``low`` to ``high``, the darker its cell."""
+    """The larger the error among those of a table, whose logarithms are ``low`` to ``high``, the
+    darker its cell."""
     if error is None:
         return None
     share = 0.0 if error == 0 or high == low else (math.log(error) - low) / (high - low)
@@ -332,12 +397,15 @@ def _shade(error: float | None, low: float, high: float) -> int | None:
 
 
 def overview(groups: Sequence[Group], cost: str) -> Scatter | None:
-    """The rows of ``groups`` that have a place on log axes: a known cost, of `COSTS`, and an error above 0; None
-    without any. On the front are rows that were given no ground truth and are not trivial."""
+    """The rows of ``groups`` that have a place on log axes: a known cost, of `COSTS`, and an error
+    above 0; None without any. On the front are rows that were given no ground truth and are not
+    trivial."""
     rows = [(group, row) for group in groups for row in group.rows]
     drawn = [_mark(number, group, row, cost) for number, (group, row) in enumerate(rows, start=1)]
     marks = [mark for mark in drawn if mark is not None]
-    return Scatter(marks, COSTS[cost], len(marks) <= _MOST_NAMES, ranked_by(groups)) if marks else None
+    return (
+        Scatter(marks, COSTS[cost], len(marks) <= _MOST_NAMES, ranked_by(groups)) if marks else None
+    )
 
 
 def ranked_by(groups: Sequence[Group]) -> str:
@@ -367,7 +435,10 @@ def _mark(number: int, group: Group, row: Ranked, cost: str) -> Mark | None:
         can_lead=group.key.track == "metric" and not is_trivial(row),
         x_span=span if cost == "seconds" else None,
         y_span=row.interval(row.rank_key),
-        title=f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, {row.provenance}",
+        title=(
+            f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, "
+            f"{row.provenance}"
+        ),
         css=f"p-{row.provenance.replace(' ', '-')}{' hollow' if hollow else ''}",
         row=slug(entry),
         url=f"{SUBMISSIONS}/{slug(entry)}.html",
@@ -375,15 +446,21 @@ def _mark(number: int, group: Group, row: Ranked, cost: str) -> Mark | None:
 
 
 def overview_figures(groups: Sequence[Group]) -> list[dict[str, Any]]:
-    """For each cost that any row has: its name, the pictures in both `SIZES`, and the front, cheapest first."""
+    """For each cost that any row has: its name, the pictures in both `SIZES`, and the front,
+    cheapest first."""
     figures = []
     for cost, across in COSTS.items():
         if (picture := overview(groups, cost)) is None:
             continue
         front = [mark.name for mark in picture.front]
-        about = f"{picture.up} against {across}, both logarithmic. On the front, cheapest first: {', '.join(front)}"
+        about = (
+            f"{picture.up} against {across}, both logarithmic. On the front, cheapest first: "
+            f"{', '.join(front)}"
+        )
         about += f". {groups[0].key.data_title}"
-        sizes = [picture.svg(width, height, f"{css} scatter", about)[0] for css, width, height in SIZES]
+        sizes = [
+            picture.svg(width, height, f"{css} scatter", about)[0] for css, width, height in SIZES
+        ]
         figures.append({"cost": cost, "pictures": sizes, "front": front})
     return figures
 
@@ -397,24 +474,31 @@ class LogScale:
 
     @classmethod
     def of(cls, rows: Sequence[Ranked]) -> "LogScale":
-        """A scale that holds the means of ``rows``, and their intervals as far down as a part of the mean."""
+        """A scale that holds the means of ``rows``, and their intervals as far down as a part of
+        the mean."""
         ranked_by = [(row.value(row.rank_key), row.interval(row.rank_key)) for row in rows]
         means = [(mean, ends or (mean, mean)) for mean, ends in ranked_by if mean]
         low = min((max(ends[0], mean / _CLIP) for mean, ends in means), default=1.0)
         return cls(low / _MARGIN, max((ends[1] for _, ends in means), default=1.0) * _MARGIN)
 
     def share(self, value_mm: float) -> float:
-        """Where a value stands, from 0 at ``low`` to 1 at ``high``; beyond them, at the nearer end."""
+        """Where a value stands, from 0 at ``low`` to 1 at ``high``; beyond them, at the nearer
+        end."""
         inside = min(max(value_mm, self.low), self.high)
         return math.log(inside / self.low) / math.log(self.high / self.low)
 
     @property
     def ticks(self) -> list[tuple[float, str]]:
-        """Place and label of the powers of ten on the scale; with multiples of them where it holds fewer than two."""
+        """Place and label of the powers of ten on the scale; with multiples of them where it holds
+        fewer than two."""
         powers = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
         for steps in _STEPS:
             values = [step * 10.0**power for power in powers for step in steps]
-            inside = [(self.share(value), f"{value:g}") for value in values if self.low <= value <= self.high]
+            inside = [
+                (self.share(value), f"{value:g}")
+                for value in values
+                if self.low <= value <= self.high
+            ]
             if len(inside) > 1:
                 break
         return inside

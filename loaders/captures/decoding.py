@@ -1,8 +1,9 @@
-"""A capture to depth: decoding with everything a user wants to know about it, a dataset of a scanner's captures, and
-captures of a calibration board, a folder of frames for each pose, to the points that a calibration needs.
+"""A capture to depth: decoding with everything a user wants to know about it, a dataset of a
+scanner's captures, and captures of a calibration board, a folder of frames for each pose, to the
+points that a calibration needs.
 
-In a dataset each capture is decoded by the scanner's rig into the ground truth ``depth``, through the same crash-safe
-assembly as a build. What the rig can't decode is background there.
+In a dataset each capture is decoded by the scanner's rig into the ground truth ``depth``, through
+the same crash-safe assembly as a build. What the rig can't decode is background there.
 """
 
 import io
@@ -14,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.calibration.projector_points import Levels, Pose, Response, fit_response, levels_of, measure_pose
+from fpp_ml_bench.calibration.projector_points import (
+    Levels,
+    Pose,
+    Response,
+    fit_response,
+    levels_of,
+    measure_pose,
+)
 from fpp_ml_bench.calibration.result import Calibration
 from fpp_ml_bench.calibration.solve import raise_all
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
@@ -61,14 +69,16 @@ CAUSES = {
 """Why nothing is decoded, by the reason of most pixels."""
 FEWEST_POSES = 3
 RANGE_MARGIN = 0.1
-"""A calibrated rig's working range is that of the boards' points, widened by this share of their distance."""
+"""A calibrated rig's working range is that of the boards' points, widened by this share of their
+distance."""
 
 
 @dataclass(frozen=True)
 class DecodedCapture:
-    """A decoded capture: maps (H, W) of standard uncertainty by noise in mm (0 = no depth), modulation and mean of the
-    frames in grey levels; the noise of a frame, and whether it was estimated from the frames; ``notes`` are sentences;
-    ``examination``: what the frames say about themselves."""
+    """A decoded capture: maps (H, W) of standard uncertainty by noise in mm (0 = no depth),
+    modulation and mean of the frames in grey levels; the noise of a frame, and whether it was
+    estimated from the frames; ``notes`` are sentences; ``examination``: what the frames say about
+    themselves."""
 
     decoded: Decoded
     sigma_mm: NDArray[np.float32]
@@ -91,26 +101,40 @@ def decode_capture(
     threads: int = 1,
     anyway: bool = False,
 ) -> DecodedCapture:
-    """Depth of a capture and what goes with it; arguments as in `decode_stack`. ``noise_grey``: of a frame, by default
-    measured where there are four steps and more, else `ASSUMED_NOISE_GREY`. The frames are examined first: raises
-    `RefusedCapture` where a finding makes the depth untrustworthy, unless ``anyway``; `CaptureError` for images of
-    another size than the rig's, `DecodeError` where nothing can be decoded."""
+    """Depth of a capture and what goes with it; arguments as in `decode_stack`. ``noise_grey``: of
+    a frame, by default measured where there are four steps and more, else `ASSUMED_NOISE_GREY`. The
+    frames are examined first: raises `RefusedCapture` where a finding makes the depth
+    untrustworthy, unless ``anyway``; `CaptureError` for images of another size than the rig's,
+    `DecodeError` where nothing can be decoded."""
     frames, limits = capture.frames, Limits(min_modulation=min_modulation)
-    decoded, examination = _examined_and_decoded(capture, rig, limits, anyway, direction, mask, threads)
+    decoded, examination = _examined_and_decoded(
+        capture, rig, limits, anyway, direction, mask, threads
+    )
     modulation = np.nanmax([measured.modulation for measured in decoded.details.values()], axis=0)
     measured_grey = noise_of_frames(list(frames), rig) if noise_grey is None else None
     noise = noise_grey if noise_grey is not None else measured_grey or ASSUMED_NOISE_GREY
     notes = [capture.note] if capture.note else []
     if noise_grey is None and measured_grey is None:
-        notes.append(f"three steps can't tell their noise; {noise:g} grey level assumed, --noise sets it")
+        notes.append(
+            f"three steps can't tell their noise; {noise:g} grey level assumed, --noise sets it"
+        )
     notes += _clipped(capture, modulation >= min_modulation, examination.full_grey)
     if not decoded.depth_mm.any():
         reason = _main_reason(decoded)
-        raise DecodeError(f"no pixel could be decoded; of most pixels: {reason.words}; probably {CAUSES[reason]}")
+        raise DecodeError(
+            f"no pixel could be decoded; of most pixels: {reason.words}; probably {CAUSES[reason]}"
+        )
     sigma_mm = depth_sigma_mm(decoded, rig, noise, systematic_rad=examination.systematic_rad)
     grey = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     return DecodedCapture(
-        decoded, sigma_mm, modulation, grey, noise, measured_grey is not None, tuple(notes), examination
+        decoded,
+        sigma_mm,
+        modulation,
+        grey,
+        noise,
+        measured_grey is not None,
+        tuple(notes),
+        examination,
     )
 
 
@@ -124,9 +148,10 @@ def _examined_and_decoded(
     threads: int = 1,
     calibrated: bool = True,
 ) -> tuple[Decoded, Examination]:
-    """The capture decoded, after what its frames say about themselves (`fpp_ml_bench.examination`). Raises
-    `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code, and
-    unless ``anyway`` `RefusedCapture` where a finding makes the depth untrustworthy."""
+    """The capture decoded, after what its frames say about themselves (`fpp_ml_bench.examination`).
+    Raises `CaptureError` for images of another size than the rig's, `RigError` for a direction that
+    it does not code, and unless ``anyway`` `RefusedCapture` where a finding makes the depth
+    untrustworthy."""
     height, width = capture.frames.shape[1:]
     folder = capture.files[0].parent
     if (height, width) != (rig.camera.height, rig.camera.width):
@@ -137,14 +162,22 @@ def _examined_and_decoded(
     directions: tuple[Direction, ...] = rig.directions if direction == "both" else (direction,)
     check_limits(limits)
     examination = examine(
-        capture.frames, rig, capture.names, directions=directions, mask=mask, limits=limits, calibrated=calibrated
+        capture.frames,
+        rig,
+        capture.names,
+        directions=directions,
+        mask=mask,
+        limits=limits,
+        calibrated=calibrated,
     )
     if examination.refused and not anyway:
         raise RefusedCapture(str(folder), examination)
     frames = capture.frames
     if examination.full_grey < GREY_LEVELS:
         frames = np.where(frames >= examination.full_grey, frames.dtype.type(GREY_LEVELS), frames)
-    decoded = decode_stack(frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
+    decoded = decode_stack(
+        frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads
+    )
     return decoded, examination
 
 
@@ -158,27 +191,44 @@ def _clipped(capture: CapturedFrames, lit: NDArray[np.bool_], full_grey: float) 
         name: float((frame[lit] >= full_grey).mean()) if lit.any() else 0.0
         for name, frame in zip(capture.names, capture.frames, strict=True)
     }
-    high = [f"{name} ({100 * share:.0f}%)" for name, share in shares.items() if share > CLIPPED_SHARE]
+    high = [
+        f"{name} ({100 * share:.0f}%)" for name, share in shares.items() if share > CLIPPED_SHARE
+    ]
     more = f" and {len(high) - 4} more" if len(high) > 4 else ""
-    piled = f", where levels pile up at {full_grey:.0f} of {GREY_LEVELS}" if full_grey < GREY_LEVELS else ""
-    return [f"saturated on lit pixels{piled}: {', '.join(high[:4])}{more}; expose less"] if high else []
+    piled = (
+        f", where levels pile up at {full_grey:.0f} of {GREY_LEVELS}"
+        if full_grey < GREY_LEVELS
+        else ""
+    )
+    return (
+        [f"saturated on lit pixels{piled}: {', '.join(high[:4])}{more}; expose less"]
+        if high
+        else []
+    )
 
 
 def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where an image or .npy file is not 0, bool (H, W). Raises `CaptureError` for another file or ``shape``, and where
-    all of it is 0."""
+    """Where an image or .npy file is not 0, bool (H, W). Raises `CaptureError` for another file or
+    ``shape``, and where all of it is 0."""
     if file.suffix.lower() == ".npy":
         content = file_content(
-            file, 8 * shape[0] * shape[1] + (1 << 14), CaptureError, "give a mask of the frames' size"
+            file,
+            8 * shape[0] * shape[1] + (1 << 14),
+            CaptureError,
+            "give a mask of the frames' size",
         )
         try:
             values = np.load(io.BytesIO(content), allow_pickle=False)
         except (ValueError, EOFError) as error:
-            raise CaptureError(f"{file}: expected a mask as .npy, can't be read: {error}") from error
+            raise CaptureError(
+                f"{file}: expected a mask as .npy, can't be read: {error}"
+            ) from error
     else:
         values = read_frames(file).frames[0]
     if values.shape != shape:
-        raise CaptureError(f"{file}: expected a mask of (H, W) = {shape} like the frames, got {values.shape}")
+        raise CaptureError(
+            f"{file}: expected a mask of (H, W) = {shape} like the frames, got {values.shape}"
+        )
     mask: NDArray[np.bool_] = np.nan_to_num(values) != 0
     if not mask.any():
         raise CaptureError(f"{file}: shows no object: all pixels are 0")
@@ -198,22 +248,29 @@ class CaptureReader(RowReader):
         return CaptureError("\n  ".join(problems))
 
     def read(self, capture: Capture) -> Row:
-        """The capture's row: frames of 8 bits, and depth from the frames as they were captured. Raises `CaptureError`
-        for frames that can't be read, that are of another size than the rig's camera, that the examination refuses
-        (unless ``anyway``), and that give almost no depth."""
+        """The capture's row: frames of 8 bits, and depth from the frames as they were captured.
+        Raises `CaptureError` for frames that can't be read, that are of another size than the rig's
+        camera, that the examination refuses (unless ``anyway``), and that give almost no depth."""
         captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
         try:
-            decoded, examination = _examined_and_decoded(captured, self.rig, self.limits, self.anyway)
+            decoded, examination = _examined_and_decoded(
+                captured, self.rig, self.limits, self.anyway
+            )
         except DecodeError as error:
             raise CaptureError(f"{capture.folder}: {error}") from error
         good, rounded = decoded.reason == Reason.DECODED, captured.frames.dtype != np.uint8
         decoded_share = float(good.mean())
-        shares = {name: count / good.size for name, count in decoded.counts.items() if count and name != "decoded"}
+        shares = {
+            name: count / good.size
+            for name, count in decoded.counts.items()
+            if count and name != "decoded"
+        }
         if decoded_share < LEAST_DECODED_SHARE:
             reason = _main_reason(decoded)
             share = shares.get(reason.name.lower(), 0.0)
             raise CaptureError(
-                f"{capture.folder}: only {100 * decoded_share:.2f}% of the pixels can be decoded, expected "
+                f"{capture.folder}: only {100 * decoded_share:.2f}% of the pixels can be decoded, "
+                f"expected "
                 f"at least {100 * LEAST_DECODED_SHARE:g}%; {100 * share:.0f}% are refused as "
                 f"{reason.words}: probably {CAUSES[reason]}"
             )
@@ -227,8 +284,13 @@ class CaptureReader(RowReader):
             "note": captured.note,
             "findings": [str(finding) for finding in examination.findings],
         }
-        frames = {i: np.rint(frame).astype(np.uint8) if rounded else frame for i, frame in enumerate(captured.frames)}
-        return Row(capture.sample, capture.object, capture.view, frames, decoded.depth_mm, None, measured)
+        frames = {
+            i: np.rint(frame).astype(np.uint8) if rounded else frame
+            for i, frame in enumerate(captured.frames)
+        }
+        return Row(
+            capture.sample, capture.object, capture.view, frames, decoded.depth_mm, None, measured
+        )
 
 
 def plan_captures(
@@ -240,11 +302,12 @@ def plan_captures(
     colour: str | None = None,
     anyway: bool = False,
 ) -> Assembly[CaptureReader]:
-    """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all frames of
-    ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``. ``limits``: of the decoder;
-    ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures that the examination refuses too.
-    Raises `CaptureError` with a line for each folder that is no capture, `BuildError` for splits that are not of these
-    objects, `DecodeError` for an impossible limit."""
+    """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all
+    frames of ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``.
+    ``limits``: of the decoder; ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures
+    that the examination refuses too. Raises `CaptureError` with a line for each folder that is no
+    capture, `BuildError` for splits that are not of these objects, `DecodeError` for an impossible
+    limit."""
     check_options(bits, colour)
     check_limits(limits := limits or Limits())
     captures = find_captures(root, len(rig.sequence))
@@ -261,12 +324,15 @@ def plan_captures(
         "colour": colour,
         "objects": {
             split: {
-                name: [c.view for c in chosen if c.object == name] for name in dict.fromkeys(c.object for c in chosen)
+                name: [c.view for c in chosen if c.object == name]
+                for name in dict.fromkeys(c.object for c in chosen)
             }
             for split, chosen in by_split.items()
         },
     }
-    reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)
+    reader = CaptureReader(
+        {capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway
+    )
     return import_plan(reader, plans, CAPTURED, settings, "all")
 
 
@@ -278,23 +344,32 @@ def capture_notes(manifest: Manifest) -> list[str]:
         notes.append("no --splits given: all objects are in split test")
     scales = sorted({row["full_scale"] for row in rows})
     if any(row["rounded"] for row in rows):
-        notes.append("depth was decoded from the frames as captured; they are stored rounded to 8 bits")
+        notes.append(
+            "depth was decoded from the frames as captured; they are stored rounded to 8 bits"
+        )
     notes += sorted({row["note"] for row in rows} - {""})
     if len(scales) > 1:
         listed = ", ".join(map(str, scales))
-        notes.append(f"white was taken as different levels ({listed}); give the camera's --bits to read all alike")
+        notes.append(
+            f"white was taken as different levels ({listed}); give the camera's --bits to read all "
+            f"alike"
+        )
     notes += [f"{row['sample']}: {finding}" for row in rows for finding in row["findings"]]
     return notes
 
 
 def pose_folders(captures: Path) -> list[Path]:
-    """The folders of the poses below ``captures``, by name. Raises `CalibrationError` for fewer than three."""
+    """The folders of the poses below ``captures``, by name. Raises `CalibrationError` for fewer
+    than three."""
     if not captures.is_dir():
-        raise CalibrationError(f"{captures}: no such folder; expected one that holds a folder of frames for each pose")
+        raise CalibrationError(
+            f"{captures}: no such folder; expected one that holds a folder of frames for each pose"
+        )
     folders = [path for path in visible(captures, CalibrationError) if path.is_dir()]
     if len(folders) < FEWEST_POSES:
         raise CalibrationError(
-            f"{captures}: expected folders of at least {FEWEST_POSES} poses of the board, found {len(folders)}"
+            f"{captures}: expected folders of at least {FEWEST_POSES} poses of the board, found "
+            f"{len(folders)}"
         )
     return folders
 
@@ -309,17 +384,19 @@ def board_poses(
     anyway: bool = False,
     examined: Callable[[str, Examination], None] = lambda name, examination: None,
 ) -> tuple[list[Pose], Rig, Response | None]:
-    """The board's points in every pose folder of ``captures``, in camera and projector px, a rig with the sequence of
-    the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`), and the response of
-    projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. The
-    frames of every pose are examined; ``anyway`` takes those that are refused, too, and ``examined`` is called with a
-    pose's name and what was found. Raises FppBenchError naming the pose or file, and all poses that are refused or have
-    no board."""
+    """The board's points in every pose folder of ``captures``, in camera and projector px, a rig
+    with the sequence of the rig file ``sequence`` that stands in for the one sought
+    (`optics.load_projection`), and the response of projector and camera where the captures tell it.
+    ``bits`` and ``colour`` as in `read_frames`. The frames of every pose are examined; ``anyway``
+    takes those that are refused, too, and ``examined`` is called with a pose's name and what was
+    found. Raises FppBenchError naming the pose or file, and all poses that are refused or have no
+    board."""
     rig = load_projection(sequence)
     if len(rig.directions) < 2:
         coded = " and ".join(rig.directions) or "crossed fringes"
         raise CalibrationError(
-            f"{sequence}: codes {coded} only; a calibration needs the projector's columns and rows, so "
+            f"{sequence}: codes {coded} only; a calibration needs the projector's columns and "
+            f"rows, so "
             "project both directions on the board"
         )
     poses: list[Pose] = []
@@ -334,21 +411,30 @@ def board_poses(
             rig = load_projection(sequence, (width, height))
         elif poses[0].size != (width, height):
             expected = f"{poses[0].size[0]} x {poses[0].size[1]} px as in {poses[0].name}"
-            raise CalibrationError(f"{folder}: images of {width} x {height} px, expected {expected}")
+            raise CalibrationError(
+                f"{folder}: images of {width} x {height} px, expected {expected}"
+            )
         for index, frame in enumerate(frames):
             other, of_other = seen.setdefault(hash(frame.tobytes()), (folder, index))
             if other != folder and np.ptp(frame):
                 raise CalibrationError(
-                    f"{folder}: image {index} is that of {other.name} (image {of_other}), byte for byte: two poses "
+                    f"{folder}: image {index} is that of {other.name} (image {of_other}), byte for "
+                    f"byte: two poses "
                     "can't share an image; put this pose's own frames there, or remove it"
                 )
         try:
-            decoded, examination = _examined_and_decoded(capture, rig, Limits(), anyway, calibrated=False)
+            decoded, examination = _examined_and_decoded(
+                capture, rig, Limits(), anyway, calibrated=False
+            )
             examined(folder.name, examination)
             white = rig.sequence.white
             lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]
             u_px, v_px = (decoded.details[direction].coordinate_px for direction in AXES)
-            poses.append(measure_pose(folder.name, np.clip(np.rint(lit), 0, 255).astype(np.uint8), u_px, v_px, board))
+            poses.append(
+                measure_pose(
+                    folder.name, np.clip(np.rint(lit), 0, 255).astype(np.uint8), u_px, v_px, board
+                )
+            )
         except (RefusedCapture, CalibrationError) as error:
             unfit.append(error)
         else:
@@ -359,18 +445,27 @@ def board_poses(
     return poses, rig, fit_response(levels)
 
 
-def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:
-    """The rig of a calibration, with the sequence of ``stand_in``; its working range is ``range_mm``, or that of the
-    boards' points and a margin. Its error is that of the poses which did not take part, or of those which did."""
+def calibrated_rig(
+    found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None
+) -> Rig:
+    """The rig of a calibration, with the sequence of ``stand_in``; its working range is
+    ``range_mm``, or that of the boards' points and a margin. Its error is that of the poses which
+    did not take part, or of those which did."""
     depths = [
-        found.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2] for pose in found.poses
+        found.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2]
+        for pose in found.poses
     ]
-    near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
+    near, far = range_mm or (
+        float(np.min(depths)) * (1 - RANGE_MARGIN),
+        float(np.max(depths)) * (1 + RANGE_MARGIN),
+    )
     return replace(
         stand_in,
         camera=found.camera.pinhole,
         projector=found.projector.pinhole,
         rotation=found.rotation,
         translation_m=found.translation_m,
-        calibration_px=found.held_out_rms_px if np.isfinite(found.held_out_rms_px) else found.rms_px.both,
+        calibration_px=found.held_out_rms_px
+        if np.isfinite(found.held_out_rms_px)
+        else found.rms_px.both,
     ).with_range((near, far))

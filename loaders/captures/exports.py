@@ -1,7 +1,8 @@
-"""What a decoding writes: depth in the forms that other programs read (.npy, .mat, 16-bit PNG, point cloud and mesh as
-PLY), other maps, a picture and a report.
+"""What a decoding writes: depth in the forms that other programs read (.npy, .mat, 16-bit PNG,
+point cloud and mesh as PLY), other maps, a picture and a report.
 
-Points are in mm in the camera's frame (x right, y down, z forward), their normals point at the camera.
+Points are in mm in the camera's frame (x right, y down, z forward), their normals point at the
+camera.
 """
 
 import io
@@ -36,8 +37,8 @@ _WRITTEN = re.compile(
 )
 """Names that a decoding writes, and those of the files that a killed one did not finish."""
 STEEPEST = 5.0
-"""Neighbouring pixels are one surface where depth changes by at most this many times their distance across the ray: a
-surface inclined by up to 79 degrees."""
+"""Neighbouring pixels are one surface where depth changes by at most this many times their distance
+across the ray: a surface inclined by up to 79 degrees."""
 MM_PER_LEVEL = (0.001, 0.01, 0.1, 1.0, 10.0)
 """Units of the PNG; the first one in which the largest depth fits is taken."""
 LARGEST_LEVEL = 65534
@@ -45,7 +46,12 @@ LARGEST_LEVEL = 65534
 
 Part = tuple[slice, slice]
 _ALL, _BEFORE, _AFTER = slice(None), slice(None, -1), slice(1, None)
-_FIRST, _RIGHT, _BELOW, _ACROSS = (_BEFORE, _BEFORE), (_BEFORE, _AFTER), (_AFTER, _BEFORE), (_AFTER, _AFTER)
+_FIRST, _RIGHT, _BELOW, _ACROSS = (
+    (_BEFORE, _BEFORE),
+    (_BEFORE, _AFTER),
+    (_AFTER, _BEFORE),
+    (_AFTER, _AFTER),
+)
 """The corners of every square of four pixels."""
 
 
@@ -56,7 +62,8 @@ def export_capture(
     grey: ArrayLike | None = None,
     forms: Sequence[str] = FORMS,
 ) -> list[Path]:
-    """Write a depth map (H, W) in mm, 0 = none, into ``folder``; returns the files written, in the order of ``forms``::
+    """Write a depth map (H, W) in mm, 0 = none, into ``folder``; returns the files written, in the
+    order of ``forms``::
 
         npy    depth.npy: float32 mm
         mat    depth.mat: float32 mm, variable depthMap
@@ -66,13 +73,20 @@ def export_capture(
                levels of 0 to 255, as intensity and colour
         mesh   mesh.ply: the same points, neighbours joined by triangles
 
-    Raises `CaptureError` for a map that is not finite, negative, empty or of another size than the camera's,
-    for grey levels that do not fit, an unknown form, or a folder that can't be written."""
+    Raises `CaptureError` for a map that is not finite, negative, empty or of another size than the
+    camera's, for grey levels that do not fit, an unknown form, or a folder that can't be
+    written."""
     if not forms or not set(forms) <= set(FORMS):
-        raise CaptureError(f"forms: expected some of {', '.join(FORMS)}, got {', '.join(map(str, forms)) or 'none'}")
+        raise CaptureError(
+            f"forms: expected some of {', '.join(FORMS)}, got "
+            f"{', '.join(map(str, forms)) or 'none'}"
+        )
     depth = _checked(depth_mm, camera, "depth_mm").astype(np.float32)
     if not depth.any():
-        raise CaptureError("depth_mm: no pixel has a depth, so there is nothing to write; check the capture's light")
+        raise CaptureError(
+            "depth_mm: no pixel has a depth, so there is nothing to write; check the capture's "
+            "light"
+        )
     shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)
     written = {
         "npy": lambda: ("depth.npy", _npy(depth)),
@@ -90,10 +104,13 @@ def _npy(values: NDArray) -> bytes:
     return buffer.getvalue()
 
 
-def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, steepest: float = STEEPEST) -> NDArray[np.float64]:
-    """Unit normals float64 (H, W, 3) of a depth map (H, W) in mm, towards the camera; 0 where there is no depth. From
-    the differences to the neighbours that belong to the same surface (``steepest`` as `STEEPEST`), and along the ray
-    where there are too few. Raises `CaptureError` as `export_capture`."""
+def pixel_normals(
+    depth_mm: ArrayLike, camera: Pinhole, steepest: float = STEEPEST
+) -> NDArray[np.float64]:
+    """Unit normals float64 (H, W, 3) of a depth map (H, W) in mm, towards the camera; 0 where there
+    is no depth. From the differences to the neighbours that belong to the same surface
+    (``steepest`` as `STEEPEST`), and along the ray where there are too few. Raises `CaptureError`
+    as `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     points = rays * depth[..., None]
     tangents = []
@@ -112,9 +129,10 @@ def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, steepest: float = STEEPE
 
 
 def triangles(depth_mm: ArrayLike, camera: Pinhole) -> NDArray[np.int64]:
-    """Triangles (M, 3) between neighbouring pixels of one surface, as indices of pixels, row * W + column, in the order
-    that makes their normals point at the camera. A square of four pixels is divided along the diagonal that gives more
-    triangles, or has the smaller step. Raises `CaptureError` as `export_capture`."""
+    """Triangles (M, 3) between neighbouring pixels of one surface, as indices of pixels, row * W +
+    column, in the order that makes their normals point at the camera. A square of four pixels is
+    divided along the diagonal that gives more triangles, or has the smaller step. Raises
+    `CaptureError` as `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     index = np.arange(depth.size).reshape(depth.shape)
 
@@ -125,32 +143,43 @@ def triangles(depth_mm: ArrayLike, camera: Pinhole) -> NDArray[np.int64]:
 
     falling = whole(_FIRST, _BELOW, _ACROSS), whole(_FIRST, _ACROSS, _RIGHT)
     rising = whole(_FIRST, _BELOW, _RIGHT), whole(_RIGHT, _BELOW, _ACROSS)
-    more = sum(there.astype(int) for there, _ in falling) - sum(there.astype(int) for there, _ in rising)
+    more = sum(there.astype(int) for there, _ in falling) - sum(
+        there.astype(int) for there, _ in rising
+    )
     flatter = np.abs(depth[_FIRST] - depth[_ACROSS]) <= np.abs(depth[_RIGHT] - depth[_BELOW])
     chosen = (more > 0) | ((more == 0) & flatter)
     parts = [(there & chosen, corners) for there, corners in falling]
     parts += [(there & ~chosen, corners) for there, corners in rising]
-    return np.concatenate([np.stack([index[corner][there] for corner in corners], -1) for there, corners in parts])
+    return np.concatenate(
+        [np.stack([index[corner][there] for corner in corners], -1) for there, corners in parts]
+    )
 
 
-def _checked(values: ArrayLike, camera: Pinhole, name: str, most: float = np.inf) -> NDArray[np.float64]:
+def _checked(
+    values: ArrayLike, camera: Pinhole, name: str, most: float = np.inf
+) -> NDArray[np.float64]:
     """``values`` as float64 (H, W) of the camera's size, from 0 to ``most``."""
     array = np.asarray(values)
     expected = (camera.height, camera.width)
     if array.dtype.kind not in "iuf" or array.shape != expected:
         raise CaptureError(
-            f"{name}: expected real numbers of shape (H, W) = {expected} of the camera, got {array.dtype} of shape "
+            f"{name}: expected real numbers of shape (H, W) = {expected} of the camera, got "
+            f"{array.dtype} of shape "
             f"{array.shape}; give the map and the calibration of the same images"
         )
     array = array.astype(np.float64)
     bad = int((~((array >= 0) & (array <= min(most, np.finfo(np.float32).max)))).sum())  # NaN too
     if bad:
         limits = f"from 0 to {most:g}" if np.isfinite(most) else "from 0, which means none, up"
-        raise CaptureError(f"{name}: expected finite numbers {limits}, got {bad} others (of {array.size} pixels)")
+        raise CaptureError(
+            f"{name}: expected finite numbers {limits}, got {bad} others (of {array.size} pixels)"
+        )
     return array
 
 
-def _rays_and_depth(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rays_and_depth(
+    depth_mm: ArrayLike, camera: Pinhole
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rays (H, W, 3) with z = 1 and the checked depth in mm; both 0 where the lens has no ray."""
     x, y = camera.rays()
     seen = np.isfinite(x) & np.isfinite(y)
@@ -159,7 +188,11 @@ def _rays_and_depth(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.fl
 
 
 def _joined(
-    rays: NDArray[np.float64], depth: NDArray[np.float64], one: Part, other: Part, steepest: float = STEEPEST
+    rays: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    one: Part,
+    other: Part,
+    steepest: float = STEEPEST,
 ) -> NDArray[np.bool_]:
     """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
     near, far = depth[one], depth[other]
@@ -177,7 +210,8 @@ def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
     if not fitting:
         limit = LARGEST_LEVEL * MM_PER_LEVEL[-1]
         raise CaptureError(
-            f"depth_mm: {largest_mm:g} mm do not fit in a 16-bit PNG, whose limit is {limit:g} mm; use npy"
+            f"depth_mm: {largest_mm:g} mm do not fit in a 16-bit PNG, whose limit is {limit:g} mm; "
+            f"use npy"
         )
     unit = fitting[0]
     levels = np.rint(depth.astype(np.float64) / unit)
@@ -188,18 +222,23 @@ def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
     return f"depth_{unit:g}mm.png", buffer.getvalue()
 
 
-def camera_points(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The points (N, 3) of a depth map (H, W), 0 = none, in mm in the camera's frame, and their pixels, bool (H, W).
-    Raises `CaptureError` for a map without any point, or as `export_capture`."""
+def camera_points(
+    depth_mm: ArrayLike, camera: Pinhole
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The points (N, 3) of a depth map (H, W), 0 = none, in mm in the camera's frame, and their
+    pixels, bool (H, W). Raises `CaptureError` for a map without any point, or as
+    `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     there = depth > 0
     if not np.any(depth_mm):
         raise CaptureError(
-            "depth_mm: all pixels are background (0), so there is no point to write; give a map that has a depth"
+            "depth_mm: all pixels are background (0), so there is no point to write; give a map "
+            "that has a depth"
         )
     if not there.any():
         raise CaptureError(
-            "depth_mm: no pixel with depth has a ray through the camera's lens, so there is no point to write; check "
+            "depth_mm: no pixel with depth has a ray through the camera's lens, so there is no "
+            "point to write; check "
             "the depth and the calibration"
         )
     return (rays * depth[..., None])[there], there
@@ -211,8 +250,8 @@ def depth_ply(
     grey: ArrayLike | None = None,
     joined: bool = False,
 ) -> bytes:
-    """PLY of `camera_points` with their normals and ``grey`` (H, W), grey levels of 0 to 255, ``joined`` by `triangles`
-    or not. Raises `CaptureError` as they do."""
+    """PLY of `camera_points` with their normals and ``grey`` (H, W), grey levels of 0 to 255,
+    ``joined`` by `triangles` or not. Raises `CaptureError` as they do."""
     from fpp_ml_bench.loaders.render.mesh_files import ply_bytes
 
     points, there = camera_points(depth_mm, camera)
@@ -223,33 +262,48 @@ def depth_ply(
 
 
 def check_outputs(folder: Path) -> list[Path]:
-    """What an earlier decoding left in ``folder``. Raises `CaptureError` for a folder that holds files which no
-    decoding writes, or a file in its place."""
+    """What an earlier decoding left in ``folder``. Raises `CaptureError` for a folder that holds
+    files which no decoding writes, or a file in its place."""
     if folder.exists() and not folder.is_dir():
-        raise CaptureError(f"{folder}: expected a folder for the results, found a file; give another name")
-    paths = sorted(path for path in folder.iterdir() if path.name != LOCK_FILE) if folder.is_dir() else []
+        raise CaptureError(
+            f"{folder}: expected a folder for the results, found a file; give another name"
+        )
+    paths = (
+        sorted(path for path in folder.iterdir() if path.name != LOCK_FILE)
+        if folder.is_dir()
+        else []
+    )
     others = [path.name for path in paths if path.is_dir() or not _WRITTEN.fullmatch(path.name)]
     if others:
         listed = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
-        raise CaptureError(f"{folder}: holds files that no decoding writes: {listed}; give a new folder")
+        raise CaptureError(
+            f"{folder}: holds files that no decoding writes: {listed}; give a new folder"
+        )
     return paths
 
 
 def clear_outputs(folder: Path) -> None:
-    """Remove what an earlier decoding left in ``folder``, also one that was killed; its report first, without which the
-    rest is no result. Raises `CaptureError` as `check_outputs`, and where a file can't be removed."""
+    """Remove what an earlier decoding left in ``folder``, also one that was killed; its report
+    first, without which the rest is no result. Raises `CaptureError` as `check_outputs`, and where
+    a file can't be removed."""
     try:
         for path in sorted(check_outputs(folder), key=lambda path: path.name != REPORT):
             path.unlink()
     except OSError as error:
-        raise CaptureError(f"{error.filename}: can't be removed ({error.strerror}); give a new folder") from error
+        raise CaptureError(
+            f"{error.filename}: can't be removed ({error.strerror}); give a new folder"
+        ) from error
 
 
 def write_capture(
-    folder: Path, capture: CapturedFrames, rig: Rig, result: DecodedCapture, forms: Sequence[str] = FORMS
+    folder: Path,
+    capture: CapturedFrames,
+    rig: Rig,
+    result: DecodedCapture,
+    forms: Sequence[str] = FORMS,
 ) -> None:
-    """Write a decoded capture in place of what an earlier decoding left in ``folder``: the ``forms`` of
-    `export_capture`, maps as .npy, a picture, and `REPORT` at last."""
+    """Write a decoded capture in place of what an earlier decoding left in ``folder``: the
+    ``forms`` of `export_capture`, maps as .npy, a picture, and `REPORT` at last."""
     clear_outputs(folder)
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
@@ -260,7 +314,13 @@ def write_capture(
         "modulation.npy": _npy(modulation),
         "reason.npy": _npy(reason),
         "picture.png": capture_picture(
-            title, result.grey, decoded.depth_mm, sigma_mm, modulation, reason, result.examination.findings
+            title,
+            result.grey,
+            decoded.depth_mm,
+            sigma_mm,
+            modulation,
+            reason,
+            result.examination.findings,
         ),
     }
     write_files(folder, contents, CaptureError)
@@ -278,7 +338,9 @@ def write_capture(
     )
 
 
-def write_report(folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, **content: object) -> None:
+def write_report(
+    folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, **content: object
+) -> None:
     """Write `REPORT` with ``content``, which a refused capture has none of."""
     report = {
         "rig": rig.to_dict(),

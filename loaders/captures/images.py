@@ -1,5 +1,6 @@
-"""Frames that a camera captured: lossless image files of 8 to 16 bits, in the order of their names; and a scanner's
-captures in folders, ``{object}/{view}/`` or ``{object}/``, with the split that each object belongs to."""
+"""Frames that a camera captured: lossless image files of 8 to 16 bits, in the order of their names;
+and a scanner's captures in folders, ``{object}/{view}/`` or ``{object}/``, with the split that each
+object belongs to."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,21 +26,36 @@ _LUMINANCE, _MEAN = (0.299, 0.587, 0.114), (1 / 3, 1 / 3, 1 / 3)
 """Weights of the channels; luminance as in Rec. 601 and OpenCV's conversion to grey."""
 COLOURS = "luminance", *_CHANNELS, "mean"
 SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
-_OTHER_IMAGES = (".jpg", ".jpeg", ".jpe", ".jp2", ".webp", ".gif", ".pgm", ".ppm", ".exr", ".hdr", ".raw", ".dng")
+_OTHER_IMAGES = (
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jp2",
+    ".webp",
+    ".gif",
+    ".pgm",
+    ".ppm",
+    ".exr",
+    ".hdr",
+    ".raw",
+    ".dng",
+)
 _MODES = ("L", "LA", "I", "I;16", "I;16L", "I;16B", "RGB", "RGBA", "P", "PA")
 _WHOLE_BITS = (8, 10, 12, 14, 16)
 CAPTURE_AGAIN = "capture or copy it again"
 _THREADS = 2
 """Each has a process that reads (`fpp_ml_bench.containers`)."""
 _QUARTER_TURNS, _MIRRORED = {3: 2, 4: 2, 5: -1, 6: -1, 7: 1, 8: 1}, (2, 4, 5, 7)
-"""What makes an image upright, by its EXIF orientation: a turn to the left, then left and right exchanged."""
+"""What makes an image upright, by its EXIF orientation: a turn to the left, then left and right
+exchanged."""
 
 
 @dataclass(frozen=True)
 class CapturedFrames:
-    """``frames`` (N, H, W): uint8 grey levels, or float32 grey levels of 0 to 255 where the files have more than 8 bits
-    or channels were weighted; ``files`` in the same order. ``full_scale``: the stored level that became 255. ``note``
-    says what was assumed about it, "" where nothing was."""
+    """``frames`` (N, H, W): uint8 grey levels, or float32 grey levels of 0 to 255 where the files
+    have more than 8 bits or channels were weighted; ``files`` in the same order. ``full_scale``:
+    the stored level that became 255. ``note`` says what was assumed about it, "" where nothing
+    was."""
 
     frames: NDArray[Any]
     files: tuple[Path, ...]
@@ -69,11 +85,12 @@ def read_frames(
 ) -> CapturedFrames:
     """The frames in ``source``, which is as in `frame_files`.
 
-    ``count``: how many there must be. ``bits``: 8 to 16, of the camera, where the files have 16; they may be the low or
-    the high bits. By default: where all levels are multiples of 4 or more, high bits; else the fewest of 8, 10, 12, 14,
-    16 bits that hold all levels; the result's ``note`` says which. ``colour``: which of `COLOURS` to take where
-    channels differ. Raises `CaptureError` naming the file for anything but complete, lossless images of one size and
-    bit depth, for levels that need more than ``bits``, and for colour without ``colour``."""
+    ``count``: how many there must be. ``bits``: 8 to 16, of the camera, where the files have 16;
+    they may be the low or the high bits. By default: where all levels are multiples of 4 or more,
+    high bits; else the fewest of 8, 10, 12, 14, 16 bits that hold all levels; the result's ``note``
+    says which. ``colour``: which of `COLOURS` to take where channels differ. Raises `CaptureError`
+    naming the file for anything but complete, lossless images of one size and bit depth, for levels
+    that need more than ``bits``, and for colour without ``colour``."""
     check_options(bits, colour)
     files = frame_files(source)
     if count is not None and len(files) != count:
@@ -88,7 +105,8 @@ def read_frames(
     for file, image in zip(files, images, strict=True):
         if (image.levels.shape, image.bits) != (first_image.levels.shape, first_image.bits):
             raise CaptureError(
-                f"{file}: expected {_kind(first_image)} as in {files[0].name}, found {_kind(image)}; give the frames "
+                f"{file}: expected {_kind(first_image)} as in {files[0].name}, found "
+                f"{_kind(image)}; give the frames "
                 "of one capture"
             )
     used = int(np.bitwise_or.reduce([image.used for image in images]))
@@ -110,10 +128,11 @@ def check_options(bits: int | None, colour: str | None) -> None:
 
 
 def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """The image files of ``source``: a folder, a pattern such as ``scan/frame_*.png`` or ``scan/*/*.png``, a file, or
-    a list of files, which keeps its order. The others are in natural order: frame_2 before frame_10. Hidden files, and
-    in a folder those that are no images by their suffix, are left out. Raises `CaptureError` where there is none, for
-    images in a folder of a form that can't be read, and for names that give no order (frame_1 and frame_01)."""
+    """The image files of ``source``: a folder, a pattern such as ``scan/frame_*.png`` or
+    ``scan/*/*.png``, a file, or a list of files, which keeps its order. The others are in natural
+    order: frame_2 before frame_10. Hidden files, and in a folder those that are no images by their
+    suffix, are left out. Raises `CaptureError` where there is none, for images in a folder of a
+    form that can't be read, and for names that give no order (frame_1 and frame_01)."""
     if not isinstance(source, str | Path):
         files = [Path(file) for file in source]
         if not files:
@@ -125,24 +144,34 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
         if not files:
             cure = "give the frames' folder"
             if folders := _folders(path):
-                cure += f", such as {folders[0]}, or a pattern of all in their order: '{path}/*/*.png'"
-            raise CaptureError(f"{path}: expected a folder with images ({forms}), found none; {cure}")
+                cure += (
+                    f", such as {folders[0]}, or a pattern of all in their order: '{path}/*/*.png'"
+                )
+            raise CaptureError(
+                f"{path}: expected a folder with images ({forms}), found none; {cure}"
+            )
     elif path.is_file():
         return [path]
-    elif set("*?[") & set(str(path.relative_to(base := next(filter(Path.is_dir, path.parents), Path())))):
+    elif set("*?[") & set(
+        str(path.relative_to(base := next(filter(Path.is_dir, path.parents), Path())))
+    ):
         files = [file for file in base.glob(str(path.relative_to(base))) if file.is_file()]
         files = [file for file in files if not re.search(r"(^|/)\.", str(file.relative_to(base)))]
         if not files:
             advice = "check it and the folder's name; it has to match files, as 'scan/*/*.png' does"
             raise CaptureError(f"{source}: no file matches this pattern; {advice}")
     else:
-        raise CaptureError(f"{path}: expected a folder, an image or a pattern such as scan/*.png, found nothing there")
+        raise CaptureError(
+            f"{path}: expected a folder, an image or a pattern such as scan/*.png, found nothing "
+            f"there"
+        )
     keys = {file: natural_key(str(file.with_suffix(""))) for file in files}
     files.sort(key=lambda file: (keys[file], str(file)))
     for file, following in pairwise(files):
         if keys[file] == keys[following]:
             raise CaptureError(
-                f"{file}: {following.name} has the same name or number, so the frames have no order; remove one of "
+                f"{file}: {following.name} has the same name or number, so the frames have no "
+                f"order; remove one of "
                 "them, or give a pattern or a list of files"
             )
     return files
@@ -163,14 +192,17 @@ def _full_scale(used: int, stored_bits: int, bits: int | None, where: Path) -> t
     """The level that counts as white, and what was assumed."""
     if stored_bits == 8:
         if bits not in (None, 8):
-            raise CaptureError(f"{where}: expected levels of {bits} bits, found images of 8 bits; leave bits out")
+            raise CaptureError(
+                f"{where}: expected levels of {bits} bits, found images of 8 bits; leave bits out"
+            )
         return GREY_LEVELS, ""
     if bits is not None:
         low = (1 << bits) - 1
         high = low << (16 - bits)
         if used & ~low and used & ~high:
             raise CaptureError(
-                f"{where}: expected levels of {bits} bits, 0 to {low} or multiples of {1 << (16 - bits)}, found levels "
+                f"{where}: expected levels of {bits} bits, 0 to {low} or multiples of "
+                f"{1 << (16 - bits)}, found levels "
                 f"that use the bits {used:b}; leave bits out, or give the camera's"
             )
         return (high, "") if used & ~low else (low, "")
@@ -178,7 +210,10 @@ def _full_scale(used: int, stored_bits: int, bits: int | None, where: Path) -> t
         return (1 << stored_bits) - 1, ""
     shift = min((used & -used).bit_length() - 1, 8) if used else 0
     if shift >= 2:
-        note = f"all levels are multiples of {1 << shift}: taken as {16 - shift} bits, shifted up by {shift}"
+        note = (
+            f"all levels are multiples of {1 << shift}: taken as {16 - shift} bits, shifted up by "
+            f"{shift}"
+        )
         return (1 << 16) - (1 << shift), note
     assumed = next(whole for whole in _WHOLE_BITS if used < 1 << whole)
     return (1 << assumed) - 1, f"no level is above {(1 << assumed) - 1}: taken as {assumed} bits"
@@ -188,9 +223,13 @@ def _read(file: Path, colour: str | None) -> _Image:
     """An image as grey levels, checked."""
     forms, suffix = "expected a PNG, BMP or TIFF image", file.suffix.lower()
     if suffix in _OTHER_IMAGES and suffix not in (".jpg", ".jpeg", ".jpe"):
-        raise CaptureError(f"{file}: {forms}, found a {file.suffix} file; convert it without loss, or leave it out")
+        raise CaptureError(
+            f"{file}: {forms}, found a {file.suffix} file; convert it without loss, or leave it out"
+        )
     if not file.is_file():
-        raise CaptureError(f"{file}: {forms}, found {'a folder' if file.is_dir() else 'nothing there'}")
+        raise CaptureError(
+            f"{file}: {forms}, found {'a folder' if file.is_dir() else 'nothing there'}"
+        )
     content = file_content(file, LARGEST_BYTES, CaptureError, CAPTURE_AGAIN)
     if not content:
         raise CaptureError(f"{file}: {forms}, found a file of 0 bytes; {CAPTURE_AGAIN}")
@@ -202,10 +241,14 @@ def _read(file: Path, colour: str | None) -> _Image:
     alpha = levels.shape[2] in (2, 4)
     if problem := _problem(image, levels[..., -1] if alpha else None):
         raise CaptureError(f"{file}: {problem}")
-    levels = np.rot90(levels[..., :-1] if alpha else levels, _QUARTER_TURNS.get(image.orientation, 0))
+    levels = np.rot90(
+        levels[..., :-1] if alpha else levels, _QUARTER_TURNS.get(image.orientation, 0)
+    )
     if image.orientation in _MIRRORED:
         levels = np.fliplr(levels)
-    return _Image(_grey(levels, colour, file), image.bits, int(np.bitwise_or.reduce(levels, axis=None)))
+    return _Image(
+        _grey(levels, colour, file), image.bits, int(np.bitwise_or.reduce(levels, axis=None))
+    )
 
 
 def _problem(image: StoredImage, alpha: NDArray[Any] | None) -> str | None:
@@ -230,7 +273,10 @@ def _grey(levels: NDArray[Any], colour: str | None, file: Path) -> NDArray[Any]:
     if (levels == levels[..., :1]).all():
         return np.ascontiguousarray(levels[..., 0])
     if colour is None:
-        raise CaptureError(f"{file}: the colour channels differ; say which to take by colour ({', '.join(COLOURS)})")
+        raise CaptureError(
+            f"{file}: the colour channels differ; say which to take by colour "
+            f"({', '.join(COLOURS)})"
+        )
     if colour in _CHANNELS:
         return np.ascontiguousarray(levels[..., _CHANNELS.index(colour)])
     red, green, blue = np.moveaxis(levels, -1, 0)
@@ -265,14 +311,16 @@ class Splits(StrictModel):
 
 
 def read_splits(file: Path) -> Splits:
-    """The splits of a YAML file with lists of objects under train, validation and test. Raises `BuildError` naming the
-    file and every key that is wrong."""
-    return validate(Splits, read_yaml(file, BuildError), file, f"list of {', '.join(SPLITS)}", BuildError)
+    """The splits of a YAML file with lists of objects under train, validation and test. Raises
+    `BuildError` naming the file and every key that is wrong."""
+    return validate(
+        Splits, read_yaml(file, BuildError), file, f"list of {', '.join(SPLITS)}", BuildError
+    )
 
 
 def split_captures(captures: Iterable[Capture], splits: Splits | None) -> dict[str, list[Capture]]:
-    """The captures of each split that has any; all in ``test`` without ``splits``. Raises `BuildError` for an object in
-    two splits or twice in one, in none, or without captures."""
+    """The captures of each split that has any; all in ``test`` without ``splits``. Raises
+    `BuildError` for an object in two splits or twice in one, in none, or without captures."""
     captures = list(captures)
     if splits is None:
         return {"test": captures}
@@ -286,38 +334,59 @@ def split_captures(captures: Iterable[Capture], splits: Splits | None) -> dict[s
         for name, found in places.items()
         if len(found) > 1
     ]
-    problems += [f"object {name!r} has no captures; remove it" for name in places if name not in objects]
-    problems += [f"object {name!r} is in no split; add it" for name in objects if name not in places]
+    problems += [
+        f"object {name!r} has no captures; remove it" for name in places if name not in objects
+    ]
+    problems += [
+        f"object {name!r} is in no split; add it" for name in objects if name not in places
+    ]
     if problems:
-        raise BuildError("\n  ".join([f"splits: expected each of {len(objects)} objects in one split", *problems]))
+        raise BuildError(
+            "\n  ".join(
+                [f"splits: expected each of {len(objects)} objects in one split", *problems]
+            )
+        )
     by_split = {split: [c for c in captures if places[c.object] == [split]] for split in SPLITS}
     return {split: chosen for split, chosen in by_split.items() if chosen}
 
 
 def find_captures(root: Path, frames: int) -> list[Capture]:
-    """The captures below ``root``, of ``frames`` images each, by object and view in the order of their names. Names
-    that begin with a dot and other files are left out. Raises `CaptureError` with a line for each folder that is no
-    capture."""
+    """The captures below ``root``, of ``frames`` images each, by object and view in the order of
+    their names. Names that begin with a dot and other files are left out. Raises `CaptureError`
+    with a line for each folder that is no capture."""
     if not root.is_dir():
-        raise CaptureError(f"{root}: expected a folder with a folder of frames for each object, found none there")
+        raise CaptureError(
+            f"{root}: expected a folder with a folder of frames for each object, found none there"
+        )
     problems: list[str] = []
     if _images(root):
-        problems.append(f"{root}: holds frames itself; move the frames of each object into a folder of its name")
+        problems.append(
+            f"{root}: holds frames itself; move the frames of each object into a folder of its name"
+        )
     captures: list[Capture] = []
     for folder in _folders(root):
         views = _folders(folder)
         with listed(problems):
             if not OBJECT_NAME.fullmatch(folder.name):
-                raise CaptureError(f"{folder}: expected an object name of letters, digits, - and _; rename the folder")
+                raise CaptureError(
+                    f"{folder}: expected an object name of letters, digits, - and _; rename the "
+                    f"folder"
+                )
             if views and _images(folder):
                 raise CaptureError(
-                    f"{folder}: holds frames and folders; give a folder of frames for each view, or frames alone"
+                    f"{folder}: holds frames and folders; give a folder of frames for each view, "
+                    f"or frames alone"
                 )
             for view in views or [folder]:
                 with listed(problems):
-                    captures.append(_capture(folder.name, view, view.name if views else SINGLE_VIEW, frames))
+                    captures.append(
+                        _capture(folder.name, view, view.name if views else SINGLE_VIEW, frames)
+                    )
     if not captures and not problems:
-        problems.append(f"{root}: holds no folder of an object; expected {root / 'OBJECT' / 'VIEW'} with the frames")
+        problems.append(
+            f"{root}: holds no folder of an object; expected {root / 'OBJECT' / 'VIEW'} with the "
+            f"frames"
+        )
     if problems:
         raise CaptureError("\n  ".join(problems))
     return captures
@@ -327,12 +396,14 @@ def _capture(name: str, folder: Path, view: str, frames: int) -> Capture:
     if not VIEW_NAME.fullmatch(view):
         suggested = f", such as {view.replace('_', '-')}" if "_" in view else ""
         raise CaptureError(
-            f"{folder}: expected a view name of letters, digits and - (no _){suggested}; rename the folder"
+            f"{folder}: expected a view name of letters, digits and - (no _){suggested}; rename "
+            f"the folder"
         )
     files = frame_files(folder)
     if len(files) != frames:
         raise CaptureError(
-            f"{folder}: expected the {frames} frames of the rig's sequence, found {len(files)} ({files[0].name} to "
+            f"{folder}: expected the {frames} frames of the rig's sequence, found {len(files)} "
+            f"({files[0].name} to "
             f"{files[-1].name}); capture what is missing, or give the rig that took them"
         )
     return Capture(name, view, folder, tuple(files))
@@ -353,4 +424,8 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def _images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
-    return [path for path in visible(folder, CaptureError) if path.is_file() and path.suffix.lower() in suffixes]
+    return [
+        path
+        for path in visible(folder, CaptureError)
+        if path.is_file() and path.suffix.lower() in suffixes
+    ]

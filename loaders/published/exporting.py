@@ -1,6 +1,7 @@
-"""Exporting a dataset: as Parquet, as the published tree (PNG fringes, .mat depth, raw scans), its meshes and patterns.
-In the tree, depth in mm is written as float32, the same bits as in the dataset. The normalised representations are
-written as float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm."""
+"""Exporting a dataset: as Parquet, as the published tree (PNG fringes, .mat depth, raw scans), its
+meshes and patterns. In the tree, depth in mm is written as float32, the same bits as in the
+dataset. The normalised representations are written as float64, from which the same float32 mm are
+recovered; float32 would be off by a few 0.0001 mm."""
 
 import shutil
 from collections.abc import Callable
@@ -29,15 +30,21 @@ SAMPLE_FORMS = ("parquet", "mat")
 """Forms whose progress is counted in samples."""
 
 _PHASE_DIRECTION: Direction = "horizontal"
-"""The published phases do not name their direction; they belong to the fringes of the single-shot frame."""
+"""The published phases do not name their direction; they belong to the fringes of the single-shot
+frame."""
 
 
 def write_tree(
-    dataset: DatasetFolder, folder: Path, splits: list[str], threads: int, row_done: Callable[[], None] = lambda: None
+    dataset: DatasetFolder,
+    folder: Path,
+    splits: list[str],
+    threads: int,
+    row_done: Callable[[], None] = lambda: None,
 ) -> None:
-    """Write ``splits`` of a dataset into ``folder`` as the published layout; raw scans where all frames are stored.
-    ``fpp-bench import`` reads the same frames, depth and splits back from the tree. The layout has no place for
-    ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written."""
+    """Write ``splits`` of a dataset into ``folder`` as the published layout; raw scans where all
+    frames are stored. ``fpp-bench import`` reads the same frames, depth and splits back from the
+    tree. The layout has no place for ``depth_exact``, which is not written. Raises ``OSError`` when
+    the disk can't be written."""
     samples = [(split, sample) for split in splits for sample in dataset.samples(split)]
     with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
         for _ in pool.map(lambda named: _write_sample(dataset, folder, *named), samples):
@@ -55,9 +62,14 @@ def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str)
     for name, variable in tree.VARIABLES.items():
         represented: NDArray = depth_mm
         if name != "raw":
-            represented = normalise(depth_mm.astype(np.float64), name, low_mm, high_mm, out=np.empty(depth_mm.shape))
+            represented = normalise(
+                depth_mm.astype(np.float64), name, low_mm, high_mm, out=np.empty(depth_mm.shape)
+            )
         depth = matrix_bytes({variable: represented})
-        for variants, image in ((tree.VARIANT_FOLDERS, fringe), (tree.BACKGROUND_REMOVED_FOLDERS, background_removed)):
+        for variants, image in (
+            (tree.VARIANT_FOLDERS, fringe),
+            (tree.BACKGROUND_REMOVED_FOLDERS, background_removed),
+        ):
             part = training / variants[name] / published_split
             _write(part / tree.FRINGE / f"{sample}.png", image)
             _write(part / tree.DEPTH / f"{sample}.mat", depth)
@@ -69,11 +81,14 @@ def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str)
 
 
 def _write_scan(dataset: DatasetFolder, sample: str, folder: Path) -> None:
-    """Frames in the paper's order, wrapped phase, and unwrapped phase (NaN where a pixel can't be decoded)."""
+    """Frames in the paper's order, wrapped phase, and unwrapped phase (NaN where a pixel can't be
+    decoded)."""
     frames = dataset.frames(sample, range(len(dataset.sequence)))
     for index, image in enumerate(frames):
         _write(folder / tree.frame_file(index), png_bytes(image))
-    measured = decode_stack(frames, dataset.rig, _PHASE_DIRECTION, details=True).details[_PHASE_DIRECTION]
+    measured = decode_stack(frames, dataset.rig, _PHASE_DIRECTION, details=True).details[
+        _PHASE_DIRECTION
+    ]
     absolute_rad = measured.coordinate_px * (2 * np.pi / dataset.rig.pitch(_PHASE_DIRECTION))
     wrapped, unwrapped = measured.phase.astype(np.float32), absolute_rad.astype(np.float32)
     _write(folder / tree.WRAPPED_PHASE, matrix_bytes({tree.WRAPPED_PHASE_VARIABLE: wrapped}))
@@ -86,7 +101,8 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
-    """Splits that ``split`` names, in row order; raises `DatasetError` when the dataset has no such samples."""
+    """Splits that ``split`` names, in row order; raises `DatasetError` when the dataset has no such
+    samples."""
     dataset.samples(split)
     return list(dataset.splits) if split == ALL_SPLITS else [split]
 
@@ -99,17 +115,23 @@ def export(
     threads: int = 1,
     progress: Callable[[int], None] = lambda rows: None,
 ) -> None:
-    """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into folders of their names.
-    ``out`` must be new or empty and is written completely or not at all; ``progress`` is called with numbers of samples
-    written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks."""
+    """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into
+    folders of their names. ``out`` must be new or empty and is written completely or not at all;
+    ``progress`` is called with numbers of samples written. Raises `BuildError` for an unusable
+    ``out`` or disk, `DatasetError` for data that the dataset lacks."""
     if not forms or not set(forms) <= set(FORMS):
-        raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
+        raise BuildError(
+            f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}"
+        )
     if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:
         raise BuildError(f"{out}: lies in the dataset itself; give another folder")
     rows = [row for split in splits for row in dataset.manifest.samples[split]]
-    if "mat" in forms and not (isinstance(dataset.sequence, Sequence) and {row["view"] for row in rows} <= set(VIEWS)):
+    if "mat" in forms and not (
+        isinstance(dataset.sequence, Sequence) and {row["view"] for row in rows} <= set(VIEWS)
+    ):
         raise DatasetError(
-            f"{dataset.path}: the published layout holds views {', '.join(VIEWS)} and the paper's kind of frames, and "
+            f"{dataset.path}: the published layout holds views {', '.join(VIEWS)} and the paper's "
+            f"kind of frames, and "
             "this dataset has others; export it as parquet"
         )
     meshes = _meshes(dataset, [row["object"] for row in rows]) if "meshes" in forms else []

@@ -1,6 +1,7 @@
-"""The published tree: its names, and a scan that lists its samples and every error in the layout that names alone show.
-Only directory entries and PNG headers are read here; contents are checked when a sample is read
-(`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored."""
+"""The published tree: its names, and a scan that lists its samples and every error in the layout
+that names alone show. Only directory entries and PNG headers are read here; contents are checked
+when a sample is read (`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and
+files beside the folders, are ignored."""
 
 import re
 from collections import Counter
@@ -8,7 +9,14 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
+from fpp_ml_bench.constants import (
+    OBJECT_NAME,
+    OBJECTS,
+    PUBLISHED_SPLIT_FOLDERS,
+    VIEWS,
+    sample_name,
+    split_sample_name,
+)
 from fpp_ml_bench.containers import PNG_GREY, PNG_HEADER_BYTES, PNG_RGB, png_header
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError, PredictionError
@@ -53,12 +61,15 @@ _COLOURS = {PNG_GREY: "grey", PNG_RGB: "RGB", 3: "palette", 4: "grey + alpha", 6
 
 
 def png_size(start: bytes) -> tuple[int, int]:
-    """Size (H, W) of an 8-bit grey or RGB PNG, by the first bytes of its file; PredictionError for any other."""
+    """Size (H, W) of an 8-bit grey or RGB PNG, by the first bytes of its file; PredictionError for
+    any other."""
     header = png_header(start)
     if header is None:
         raise PredictionError("expected a PNG file, got other content")
     if header.bits != 8:
-        raise PredictionError(f"expected an 8-bit PNG, got {header.bits} bits per channel; convert it to 8 bits")
+        raise PredictionError(
+            f"expected an 8-bit PNG, got {header.bits} bits per channel; convert it to 8 bits"
+        )
     if header.colour not in (PNG_GREY, PNG_RGB):
         colour = _COLOURS.get(header.colour, header.colour)
         raise PredictionError(f"expected a grey PNG, or RGB with equal channels, got {colour}")
@@ -71,7 +82,8 @@ def frame_file(index: int) -> str:
 
 
 def layout_error(root: object, problems: list[str]) -> LayoutError:
-    """The error that lists the problems of a tree, a line each, at most `LISTED_PROBLEMS` of them."""
+    """The error that lists the problems of a tree, a line each, at most `LISTED_PROBLEMS` of
+    them."""
     problems = "\n".join(problems).splitlines()
     shown = problems[:LISTED_PROBLEMS]
     if len(problems) > len(shown):
@@ -82,7 +94,8 @@ def layout_error(root: object, problems: list[str]) -> LayoutError:
 
 @dataclass(frozen=True)
 class PublishedSample:
-    """Files of a sample: fringe and depth per variant in the tree's order, depth range, raw frames in file order."""
+    """Files of a sample: fringe and depth per variant in the tree's order, depth range, raw frames
+    in file order."""
 
     sample: str
     object: str
@@ -100,7 +113,8 @@ class PublishedSample:
 
 @dataclass(frozen=True)
 class PublishedTree:
-    """A tree with a valid layout: image size (H, W), variants present, samples split by split in row order."""
+    """A tree with a valid layout: image size (H, W), variants present, samples split by split in
+    row order."""
 
     root: Path
     size: tuple[int, int]
@@ -114,7 +128,8 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
     """Folders of the training data and of the raw scans."""
     if not root.is_dir():
         raise LayoutError(
-            f"{root}: no such folder; give the folder that holds {TRAINING}/, or OWNER/NAME of a dataset on the "
+            f"{root}: no such folder; give the folder that holds {TRAINING}/, or OWNER/NAME of a "
+            f"dataset on the "
             "Hugging Face Hub"
         )
     scans = root / RAW_SCANS if (root / RAW_SCANS).is_dir() else None
@@ -123,7 +138,8 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
         return training, scans
     if scans or root.name == RAW_SCANS:
         raise LayoutError(
-            f"{root}: raw scans alone have no depth in mm (z.csv is in the reconstruction's own units); put them "
+            f"{root}: raw scans alone have no depth in mm (z.csv is in the reconstruction's own "
+            f"units); put them "
             f"beside {TRAINING}/, which holds it"
         )
     if any((training / folder).is_dir() for folder in BACKGROUND_REMOVED_FOLDERS.values()):
@@ -132,43 +148,73 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
             f"add {VARIANT_FOLDERS['raw']}/"
         )
     raise LayoutError(
-        f"{root}: expected {TRAINING}/ with one of {', '.join(VARIANT_FOLDERS.values())}, got none of them"
+        f"{root}: expected {TRAINING}/ with one of {', '.join(VARIANT_FOLDERS.values())}, got none "
+        f"of them"
     )
 
 
 def scan_tree(root: Path, frames: int, only: Collection[str] | None = None) -> PublishedTree:
-    """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
-    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself. Of
-    the folders of variants and raw scans, those that ``only`` names are read; None: all."""
+    """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError`
+    listing all problems. ``root`` holds ``training_datasets/`` and maybe
+    ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself. Of the folders of variants and
+    raw scans, those that ``only`` names are read; None: all."""
     training, scans = _locate(root)
     scans = scans if only is None or RAW_SCANS in only else None
-    read = {name: folder for name, folder in VARIANT_FOLDERS.items() if only is None or folder in only}
+    read = {
+        name: folder for name, folder in VARIANT_FOLDERS.items() if only is None or folder in only
+    }
     variants = tuple(name for name, folder in read.items() if (training / folder).is_dir())
     folders, info = [training / VARIANT_FOLDERS[name] for name in variants], training / INFO
     names, problems = PUBLISHED_SPLIT_FOLDERS.values(), list[str]()
-    files = {file for folder in folders for file in _files(folder, (names, _KINDS, _SAMPLE_FILE), _LAYOUT, problems)}
+    files = {
+        file
+        for folder in folders
+        for file in _files(folder, (names, _KINDS, _SAMPLE_FILE), _LAYOUT, problems)
+    }
     expected = set[Path]()
     if info.is_dir():
         files |= _files(info, (names, (DEPTH,), _SAMPLE_FILE), _LAYOUT, problems)
     elif variants == ("individual",):
-        problems.append(f"{info}: the folder is missing; normalised depth can't be converted to mm without it")
+        problems.append(
+            f"{info}: the folder is missing; normalised depth can't be converted to mm without it"
+        )
     samples: list[PublishedSample] = []
     for split, name in PUBLISHED_SPLIT_FOLDERS.items():
         parts = [folder / name for folder in folders]
-        stems = {file.stem for file in files if file.parent.parent in parts and file.suffix == _KINDS[file.parent.name]}
+        stems = {
+            file.stem
+            for file in files
+            if file.parent.parent in parts and file.suffix == _KINDS[file.parent.name]
+        }
         for stem in sorted(stems, key=_place):
-            fringes, depths = (tuple(part / kind / f"{stem}{_KINDS[kind]}" for part in parts) for kind in _KINDS)
-            label, limits = split_sample_name(stem), info / name / DEPTH / f"{stem}.mat" if info.is_dir() else None
-            raw = [scans.joinpath(*label, frame_file(index)) for index in range(frames)] if scans else ()
-            samples.append(PublishedSample(stem, *label, split, fringes, depths, limits, tuple(raw)))
+            fringes, depths = (
+                tuple(part / kind / f"{stem}{_KINDS[kind]}" for part in parts) for kind in _KINDS
+            )
+            label, limits = (
+                split_sample_name(stem),
+                info / name / DEPTH / f"{stem}.mat" if info.is_dir() else None,
+            )
+            raw = (
+                [scans.joinpath(*label, frame_file(index)) for index in range(frames)]
+                if scans
+                else ()
+            )
+            samples.append(
+                PublishedSample(stem, *label, split, fringes, depths, limits, tuple(raw))
+            )
             expected.update(samples[-1].files)
     problems += [f"{file}: belongs to no sample of this split" for file in sorted(files - expected)]
     if scans:
         frame_files = [frame_file(index) for index in range(frames)]
         layout = f"OBJECT/VIEW/ with {frame_files[0]} to {frame_files[-1]}, {', '.join(NOT_STORED)}"
-        raw_files = _files(scans, (OBJECT_NAME, VIEWS, {*frame_files, *NOT_STORED}), layout, problems)
+        raw_files = _files(
+            scans, (OBJECT_NAME, VIEWS, {*frame_files, *NOT_STORED}), layout, problems
+        )
         views = {file.parent for file in raw_files} - {path.parent for path in expected}
-        problems += [f"{view}: a raw scan without depth; {TRAINING} has no such sample" for view in sorted(views)]
+        problems += [
+            f"{view}: a raw scan without depth; {TRAINING} has no such sample"
+            for view in sorted(views)
+        ]
         files |= raw_files
     missing = sorted(expected - files)
     problems += [
@@ -177,39 +223,53 @@ def scan_tree(root: Path, frames: int, only: Collection[str] | None = None) -> P
         if not folder.is_dir()
     ]
     problems += [
-        f"{path}: is missing, and other files of its sample are there" for path in missing if path.parent.is_dir()
+        f"{path}: is missing, and other files of its sample are there"
+        for path in missing
+        if path.parent.is_dir()
     ]
     problems += _object_problems(samples)
     if not samples and not problems:
         problems.append(f"{folders[0]}: holds no sample")
     size = _image_size(
-        [path for sample in samples for path in (*sample.fringes, *sample.frames) if path in files], problems
+        [path for sample in samples for path in (*sample.fringes, *sample.frames) if path in files],
+        problems,
     )
     if problems:
         raise layout_error(root, problems)
     ignored = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (training / name).is_dir()]
     if scans:
-        ignored += [f"{RAW_SCANS}/*/*/{name}" for name in NOT_STORED if next(scans.glob(f"*/*/{name}"), None)]
+        ignored += [
+            f"{RAW_SCANS}/*/*/{name}"
+            for name in NOT_STORED
+            if next(scans.glob(f"*/*/{name}"), None)
+        ]
     return PublishedTree(root, size, variants, samples, scans is not None, tuple(ignored))
 
 
 def _place(stem: str) -> tuple[int, str, int]:
-    """Sort key of a sample: the benchmark's objects in their order, then all other objects by name; by view."""
+    """Sort key of a sample: the benchmark's objects in their order, then all other objects by name;
+    by view."""
     name, view = split_sample_name(stem)
     return OBJECTS.index(name) if name in OBJECTS else len(OBJECTS), name, VIEWS.index(view)
 
 
 def _files(
-    folder: Path, levels: Sequence[Collection[str] | re.Pattern[str]], layout: str, problems: list[str]
+    folder: Path,
+    levels: Sequence[Collection[str] | re.Pattern[str]],
+    layout: str,
+    problems: list[str],
 ) -> set[Path]:
-    """Files below a folder whose path has a name of each level; adds a problem for any other file or folder, which says
-    what ``layout`` is expected."""
+    """Files below a folder whose path has a name of each level; adds a problem for any other file
+    or folder, which says what ``layout`` is expected."""
     (names, *below), files = levels, set[Path]()
     for entry in visible(folder, LayoutError):
         fits = names.fullmatch(entry.name) if isinstance(names, re.Pattern) else entry.name in names
         if not fits or entry.is_dir() != bool(below):
             if names is _SAMPLE_FILE and entry.suffix in _KINDS.values():
-                problems.append(f"{entry}: expected a name like {_EXAMPLE}{entry.suffix}, views {', '.join(VIEWS)}")
+                problems.append(
+                    f"{entry}: expected a name like {_EXAMPLE}{entry.suffix}, views "
+                    f"{', '.join(VIEWS)}"
+                )
             else:
                 problems.append(f"{entry}: does not belong here; expected {layout}")
         elif below:
@@ -228,7 +288,9 @@ def _object_problems(samples: list[PublishedSample]) -> list[str]:
     for name, by_split in first_files.items():
         first, *others = by_split.values()
         if others:
-            problems.append(f"{first}: object {name} is in two splits, see {', '.join(map(str, others))}")
+            problems.append(
+                f"{first}: object {name} is in two splits, see {', '.join(map(str, others))}"
+            )
         if missing := [stem for view in VIEWS if (stem := sample_name(name, view)) not in stems]:
             problems.append(f"{first.parent}: object {name} lacks {', '.join(missing)}")
     return problems
@@ -245,7 +307,8 @@ def _image_size(paths: list[Path], problems: list[str]) -> tuple[int, int]:
             problems.append(f"{path}: {error}")
     common = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
     problems += [
-        f"{path}: expected {common[1]} x {common[0]} px as most images here, got {size[1]} x {size[0]}"
+        f"{path}: expected {common[1]} x {common[0]} px as most images here, got {size[1]} x "
+        f"{size[0]}"
         for path, size in sizes.items()
         if size != common
     ]

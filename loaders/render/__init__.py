@@ -1,1 +1,2 @@
-"""The virtual rig: meshes, scene, ray casting, light, sensor, and building the benchmark from them."""
+"""The virtual rig: meshes, scene, ray casting, light, sensor, and building the benchmark from
+them."""

@@ -1,8 +1,10 @@
-"""What a light is: every number of the image formation, stage by stage, as ``--light`` takes it from YAML.
+"""What a light is: every number of the image formation, stage by stage, as ``--light`` takes it
+from YAML.
 
-The stages in the order in which light passes them: projector (`projector`), surface (`surface`, `textures`), further
-bounces (`surfels`, `bounces`), camera optics (`pixels`) and sensor (`sensor`). A stage that is off costs nothing.
-Grey levels are those of the 8-bit image, before the camera's response.
+The stages in the order in which light passes them: projector (`projector`), surface (`surface`,
+`textures`), further bounces (`surfels`, `bounces`), camera optics (`pixels`) and sensor (`sensor`).
+A stage that is off costs nothing. Grey levels are those of the 8-bit image, before the camera's
+response.
 """
 
 from functools import cache
@@ -35,18 +37,21 @@ def _ascending(curve: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Power = Annotated[float, Field(ge=0.2, le=5)]
-Curve = Annotated[tuple[Share, ...], Field(min_length=2, max_length=256), AfterValidator(_ascending)]
+Curve = Annotated[
+    tuple[Share, ...], Field(min_length=2, max_length=256), AfterValidator(_ascending)
+]
 Response = Annotated[Power | Curve, BeforeValidator(as_tuple)]
 """The power of the input, or outputs at evenly spaced inputs from 0 to 1."""
 Blur = Annotated[float, Field(ge=0, le=20)]
 Falloff = Annotated[int, Field(ge=-3, le=8)]
-"""Brightness goes as the cosine of the angle to the axis to this power: 0 even in every direction, 4 a simple lens; for
-a projector -3 gives an even screen, as an ideal one does."""
+"""Brightness goes as the cosine of the angle to the axis to this power: 0 even in every direction,
+4 a simple lens; for a projector -3 gives an even screen, as an ideal one does."""
 
 
 class ProjectorLight(StrictModel):
-    """``response``: linear light of pattern levels. ``pixel_blur_px``: sigma in focus. ``focus_m`` and ``defocus_px``:
-    distance of best focus, and sigma at the far end of the working range. ``flicker``: relative sigma per frame."""
+    """``response``: linear light of pattern levels. ``pixel_blur_px``: sigma in focus. ``focus_m``
+    and ``defocus_px``: distance of best focus, and sigma at the far end of the working range.
+    ``flicker``: relative sigma per frame."""
 
     response: Response = 1.0
     pixel_blur_px: Blur = 0.0
@@ -60,10 +65,11 @@ SHARES = ("object_share", "wall_share")
 
 
 class SurfaceLight(StrictModel):
-    """``albedo`` of the diffuse part; ``gloss``: weight of a GGX microfacet lobe of ``roughness`` (its alpha is the
-    square). ``textures``: none, or albedo maps by the object's kind, whose dark parts have (1 - ``contrast``) of the
-    albedo; with them ``gloss`` is the most, and each object has its share of it. ``object_share`` and ``wall_share`` of
-    the albedo are what the object and the background plane have: dark paint, a dark wall, none."""
+    """``albedo`` of the diffuse part; ``gloss``: weight of a GGX microfacet lobe of ``roughness``
+    (its alpha is the square). ``textures``: none, or albedo maps by the object's kind, whose dark
+    parts have (1 - ``contrast``) of the albedo; with them ``gloss`` is the most, and each object
+    has its share of it. ``object_share`` and ``wall_share`` of the albedo are what the object and
+    the background plane have: dark paint, a dark wall, none."""
 
     albedo: Annotated[float, Field(gt=0, le=0.95)] = 0.8
     gloss: Annotated[float, Field(ge=0, le=0.95)] = 0.0
@@ -80,14 +86,17 @@ class SurfaceLight(StrictModel):
 
     @model_serializer(mode="wrap")
     def _described(self, described: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A share of 1 is left out, so that lights from before there were shares keep their fingerprints."""
+        """A share of 1 is left out, so that lights from before there were shares keep their
+        fingerprints."""
         content: dict[str, Any] = described(self)
-        return {key: value for key, value in content.items() if not (key in SHARES and value == 1.0)}
+        return {
+            key: value for key, value in content.items() if not (key in SHARES and value == 1.0)
+        }
 
 
 class BounceLight(StrictModel):
-    """``interreflection`` between the object's parts and from the background plane to it; ``ambient_occlusion`` of the
-    ambient light; ``shadows`` of the projector's light."""
+    """``interreflection`` between the object's parts and from the background plane to it;
+    ``ambient_occlusion`` of the ambient light; ``shadows`` of the projector's light."""
 
     interreflection: bool = True
     ambient_occlusion: bool = True
@@ -95,11 +104,12 @@ class BounceLight(StrictModel):
 
 
 class CameraLight(StrictModel):
-    """``rays_across``: rays across a pixel that mixes surfaces; 1 is the central ray alone. ``blur_px``: sigma of the
-    lens. ``reference_grey``: direct white light on the matte part of the material, facing the projector at the near end
-    of the range, at exposure 1. ``exposure``: factor, or the ends of a range from which each view draws one, evenly by
-    its logarithm. ``full_well_e``: electrons at grey level 255, null for no noise. ``bits`` of the converter, whose
-    codes ``response`` (a power, or a measured curve) turns into 8-bit grey levels."""
+    """``rays_across``: rays across a pixel that mixes surfaces; 1 is the central ray alone.
+    ``blur_px``: sigma of the lens. ``reference_grey``: direct white light on the matte part of the
+    material, facing the projector at the near end of the range, at exposure 1. ``exposure``:
+    factor, or the ends of a range from which each view draws one, evenly by its logarithm.
+    ``full_well_e``: electrons at grey level 255, null for no noise. ``bits`` of the converter,
+    whose codes ``response`` (a power, or a measured curve) turns into 8-bit grey levels."""
 
     rays_across: Annotated[int, Field(ge=1, le=8)] = 2
     blur_px: Blur = 0.0
@@ -120,9 +130,10 @@ class CameraLight(StrictModel):
 
 
 class Light(StrictModel):
-    """All stages. ``ambient_grey``: ambient light on the material in the open. ``motion_mm``: movement of the object
-    from frame to frame, in a direction drawn for each view. ``calibration_px``: RMS distance in projector px between
-    the rig that photographs and the one that decodes."""
+    """All stages. ``ambient_grey``: ambient light on the material in the open. ``motion_mm``:
+    movement of the object from frame to frame, in a direction drawn for each view.
+    ``calibration_px``: RMS distance in projector px between the rig that photographs and the one
+    that decodes."""
 
     name: Text
     projector: ProjectorLight = ProjectorLight()
@@ -157,7 +168,8 @@ class Light(StrictModel):
         }
 
     def changed(self, stage: str = "", **values: Any) -> "Light":
-        """A copy with other values, of ``stage`` or, with none, of the light itself; checked like a file."""
+        """A copy with other values, of ``stage`` or, with none, of the light itself; checked like a
+        file."""
         content = self.model_dump()
         (content[stage] if stage else content).update(values)
         return Light.model_validate(content)
@@ -170,7 +182,8 @@ def named_light(name: str) -> Light:
 
 
 def load_light(name_or_file: str | Path) -> Light:
-    """A named light, or one from a YAML file; raises `BuildError` naming the file and every key that is wrong."""
+    """A named light, or one from a YAML file; raises `BuildError` naming the file and every key
+    that is wrong."""
     if str(name_or_file) in NAMED:
         return named_light(str(name_or_file))
     file = Path(name_or_file)

@@ -1,7 +1,9 @@
-"""A mesh's own albedo: the colours that its file gives to corners, faces and materials, and the images on it.
+"""A mesh's own albedo: the colours that its file gives to corners, faces and materials, and the
+images on it.
 
-Of a colour only the luminance counts, with the weights of ITU-R BT.709, after its 8-bit sRGB values (IEC 61966-2-1)
-have been made linear. In a GLB all colours but those of images are linear already (glTF 2.0, section 3.9.2).
+Of a colour only the luminance counts, with the weights of ITU-R BT.709, after its 8-bit sRGB values
+(IEC 61966-2-1) have been made linear. In a GLB all colours but those of images are linear already
+(glTF 2.0, section 3.9.2).
 """
 
 from collections.abc import Sequence
@@ -26,10 +28,12 @@ _ROWS_AT_ONCE = 256  # of an image whose luminance is computed: eight bytes a ch
 
 @dataclass(frozen=True)
 class Paint:
-    """Luminance on the F triangles of a mesh, from 0 to 1: that of their corners times that of the image on them.
+    """Luminance on the F triangles of a mesh, from 0 to 1: that of their corners times that of the
+    image on them.
 
-    ``corner`` float32 (F, 3), linear. ``uv`` float32 (F, 3, 2): the corners' places on an image, v up, which repeats
-    beyond [0, 1]. ``image`` int32 (F,): row of ``images``, -1 for none; each is float32 (H, W), linear.
+    ``corner`` float32 (F, 3), linear. ``uv`` float32 (F, 3, 2): the corners' places on an image, v
+    up, which repeats beyond [0, 1]. ``image`` int32 (F,): row of ``images``, -1 for none; each is
+    float32 (H, W), linear.
     """
 
     corner: NDArray[np.float32]
@@ -37,8 +41,11 @@ class Paint:
     image: NDArray[np.int32]
     images: tuple[NDArray[np.float32], ...] = ()
 
-    def at(self, triangle: NDArray[np.integer], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Luminance at the places of ``triangle`` (n,) that have the barycentric ``weights`` (n, 3); float64 (n,)."""
+    def at(
+        self, triangle: NDArray[np.integer], weights: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Luminance at the places of ``triangle`` (n,) that have the barycentric ``weights`` (n,
+        3); float64 (n,)."""
         luminance = _weighted(self.corner[triangle], weights)
         on = self.image[triangle]
         for number, image in enumerate(self.images):
@@ -49,11 +56,16 @@ class Paint:
 
 
 def _weighted(corners: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    return weights[:, 0] * corners[:, 0] + weights[:, 1] * corners[:, 1] + weights[:, 2] * corners[:, 2]
+    return (
+        weights[:, 0] * corners[:, 0]
+        + weights[:, 1] * corners[:, 1]
+        + weights[:, 2] * corners[:, 2]
+    )
 
 
 def barycentric(corners: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights float64 (n, 3), none below 0, of the corners (n, 3, 3) of n triangles at positions (n, 3) on them."""
+    """Weights float64 (n, 3), none below 0, of the corners (n, 3, 3) of n triangles at positions
+    (n, 3) on them."""
     a = corners[:, 0]
     first, second, to = corners[:, 1] - a, corners[:, 2] - a, position - a
     normal = np.cross(first, second)
@@ -66,14 +78,18 @@ def barycentric(corners: NDArray[np.float64], position: NDArray[np.float64]) -> 
     return np.column_stack([1.0 - b - c, b, c])
 
 
-def bilinear(image: NDArray[np.float32], u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A repeating image (H, W) at places (n,) in its widths and heights from the lower left corner; float64 (n,)."""
+def bilinear(
+    image: NDArray[np.float32], u: NDArray[np.float64], v: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """A repeating image (H, W) at places (n,) in its widths and heights from the lower left corner;
+    float64 (n,)."""
     height, width = image.shape
     x, y = (u - np.floor(u)) * width - 0.5, (np.ceil(v) - v) * height - 0.5
     left, top = np.floor(x), np.floor(y)
     across, down = x - left, y - top
     columns, rows = (
-        [(first.astype(np.int64) + step) % size for step in (0, 1)] for first, size in ((left, width), (top, height))
+        [(first.astype(np.int64) + step) % size for step in (0, 1)]
+        for first, size in ((left, width), (top, height))
     )
     upper = image[rows[0], columns[0]] * (1.0 - across) + image[rows[0], columns[1]] * across
     lower = image[rows[1], columns[0]] * (1.0 - across) + image[rows[1], columns[1]] * across
@@ -99,10 +115,13 @@ def _luminance(linear: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def texture_of(image: Image.Image) -> NDArray[np.float32]:
-    """Linear luminance of an image, float32 (H, W); its transparency is of no consequence. Raises ``ValueError`` for
-    one that is too large or of numbers that are no colours, and what Pillow raises for a damaged one."""
+    """Linear luminance of an image, float32 (H, W); its transparency is of no consequence. Raises
+    ``ValueError`` for one that is too large or of numbers that are no colours, and what Pillow
+    raises for a damaged one."""
     if image.width * image.height > MOST_TEXTURE_PX:
-        raise ValueError(f"{image.width} x {image.height} px, expected at most {MOST_TEXTURE_PX} px in all")
+        raise ValueError(
+            f"{image.width} x {image.height} px, expected at most {MOST_TEXTURE_PX} px in all"
+        )
     if image.mode == "F":
         raise ValueError("has floating-point pixels, expected 8 or 16 bits")
     deep = image.mode.startswith("I")  # 16 bits
@@ -111,13 +130,16 @@ def texture_of(image: Image.Image) -> NDArray[np.float32]:
     for start in range(0, len(levels), _ROWS_AT_ONCE):
         rows = levels[start : start + _ROWS_AT_ONCE]
         grey = np.clip(np.rint(rows / 257), 0, GREY_LEVELS).astype(np.uint8) if deep else None
-        result[start : start + _ROWS_AT_ONCE] = linear_luminance(rows) if grey is None else _LINEAR[grey]
+        result[start : start + _ROWS_AT_ONCE] = (
+            linear_luminance(rows) if grey is None else _LINEAR[grey]
+        )
     return result
 
 
 def paint_of(parts: Sequence[trimesh.Trimesh], linear_colours: bool) -> Paint | None:
-    """The paint of parts that are joined in this order, or None if none of them has colours. ``linear_colours``: those
-    of corners and materials are linear. Raises ``ValueError`` for colours that can't be right."""
+    """The paint of parts that are joined in this order, or None if none of them has colours.
+    ``linear_colours``: those of corners and materials are linear. Raises ``ValueError`` for colours
+    that can't be right."""
     images: dict[bytes, NDArray[np.float32]] = {}  # materials may share one
     corners, places, numbers = [], [], []
     painted = False
@@ -134,16 +156,32 @@ def paint_of(parts: Sequence[trimesh.Trimesh], linear_colours: bool) -> Paint | 
         numbers.append(np.full(faces, number, dtype=np.int32))
     if not painted:
         return None
-    return Paint(np.concatenate(corners), np.concatenate(places), np.concatenate(numbers), tuple(images.values()))
+    return Paint(
+        np.concatenate(corners),
+        np.concatenate(places),
+        np.concatenate(numbers),
+        tuple(images.values()),
+    )
 
 
 def _of_part(part: trimesh.Trimesh, linear_colours: bool) -> tuple[Any, Any, Any]:
-    """Corners' luminance (F, 3), their uv (F, 3, 2) and the image (H, W) on them, each None if there is none."""
+    """Corners' luminance (F, 3), their uv (F, 3, 2) and the image (H, W) on them, each None if
+    there is none."""
     visual: Any = part.visual
     if visual.kind == "face":
-        return np.repeat(_colours(visual.face_colors, len(part.faces), linear_colours)[:, None], 3, axis=1), None, None
+        return (
+            np.repeat(
+                _colours(visual.face_colors, len(part.faces), linear_colours)[:, None], 3, axis=1
+            ),
+            None,
+            None,
+        )
     if visual.kind == "vertex":
-        return _colours(visual.vertex_colors, len(part.vertices), linear_colours)[part.faces], None, None
+        return (
+            _colours(visual.vertex_colors, len(part.vertices), linear_colours)[part.faces],
+            None,
+            None,
+        )
     if visual.kind != "texture":
         return None, None, None
     material, corner, uv, texture = visual.material, None, None, None
@@ -159,7 +197,9 @@ def _of_part(part: trimesh.Trimesh, linear_colours: bool) -> tuple[Any, Any, Any
             raise ValueError("has places on its texture that are not finite, or far beyond it")
         texture = texture_of(image)
     colour = getattr(material, "baseColorFactor", None)
-    if colour is None and texture is None:  # beside an image an MTL's diffuse colour is often black, and not meant
+    if (
+        colour is None and texture is None
+    ):  # beside an image an MTL's diffuse colour is often black, and not meant
         colour = getattr(material, "kwargs", {}).get("kd")
     if colour is not None:
         colour = np.asarray(colour)
@@ -170,7 +210,9 @@ def _of_part(part: trimesh.Trimesh, linear_colours: bool) -> tuple[Any, Any, Any
         corner = np.full((len(part.faces), 3), _colours(levels, 1, linear_colours)[0])
     own = (visual.vertex_attributes or {}).get("color")
     if own is not None:
-        own = _colours(trimesh.visual.color.to_rgba(own), len(part.vertices), linear_colours)[part.faces]
+        own = _colours(trimesh.visual.color.to_rgba(own), len(part.vertices), linear_colours)[
+            part.faces
+        ]
         corner = own if corner is None else corner * own
     return corner, uv, texture
 

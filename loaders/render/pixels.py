@@ -1,7 +1,8 @@
 """The camera's optics: pixels with an area, the blur of its lens, vignetting.
 
-A pixel's light is the mean of what the rays across it see. More than the central ray is traced only for pixels that mix
-surfaces: the object and what is behind it, parts at different depths, sides of an edge, or light and shadow.
+A pixel's light is the mean of what the rays across it see. More than the central ray is traced only
+for pixels that mix surfaces: the object and what is behind it, parts at different depths, sides of
+an edge, or light and shadow.
 """
 
 from dataclasses import dataclass
@@ -17,16 +18,18 @@ from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 
 APART_MM = 2.0
-"""Rays of a pixel see different surfaces where a depth is this far from the plane that the central ray sees."""
+"""Rays of a pixel see different surfaces where a depth is this far from the plane that the central
+ray sees."""
 _EDGE_COSINE = 0.9
 
 
 @dataclass(frozen=True)
 class MixedPixels:
-    """Pixels that need more than their central ray. Flat ``pixels`` int64 (m,) ascending; per pixel and ray, (m s^2,)
-    in turn: ``points_m`` and ``normals`` float64 (m s^2, 3), on the ``triangle`` int32, a row of the mesh's faces, or
-    on the background plane: -1. ``void`` bool (m,): whether surfaces at different depths mix. ``share`` float64 (m,):
-    of the rays, on the surface that the central ray sees."""
+    """Pixels that need more than their central ray. Flat ``pixels`` int64 (m,) ascending; per pixel
+    and ray, (m s^2,) in turn: ``points_m`` and ``normals`` float64 (m s^2, 3), on the ``triangle``
+    int32, a row of the mesh's faces, or on the background plane: -1. ``void`` bool (m,): whether
+    surfaces at different depths mix. ``share`` float64 (m,): of the rays, on the surface that the
+    central ray sees."""
 
     pixels: NDArray[np.int64]
     points_m: NDArray[np.float64]
@@ -40,8 +43,9 @@ class MixedPixels:
 def mixed_pixels(
     traced: TracedObject, hits: Hits, rig: Rig, across: int, lit: NDArray[np.bool_] | None = None
 ) -> MixedPixels:
-    """The pixels of a view that mix surfaces, seen with ``across`` x ``across`` rays each; ``hits`` of the central.
-    ``lit`` bool, one a hit: adds the pixels on both sides of where it changes, borders of shadows."""
+    """The pixels of a view that mix surfaces, seen with ``across`` x ``across`` rays each; ``hits``
+    of the central. ``lit`` bool, one a hit: adds the pixels on both sides of where it changes,
+    borders of shadows."""
     camera, total = rig.camera, across * across
     width, count = camera.width, camera.width * camera.height
     ray_x, ray_y = (axis.ravel() for axis in camera.rays())
@@ -49,9 +53,13 @@ def mixed_pixels(
     central[hits.pixels] = np.arange(hits.pixels.size)
     chosen = np.zeros(count, dtype=bool)
     n = hits.normals
-    distance = hits.depth_m * (n[:, 0] * ray_x[hits.pixels] + n[:, 1] * ray_y[hits.pixels] + n[:, 2])
+    distance = hits.depth_m * (
+        n[:, 0] * ray_x[hits.pixels] + n[:, 1] * ray_y[hits.pixels] + n[:, 2]
+    )
     mark_neighbours(width, central, hits.pixels, hits.depth_m, n, distance, ray_x, ray_y, chosen)
-    state = np.zeros((camera.height, width), dtype=np.int8)  # without light to tell apart no borders
+    state = np.zeros(
+        (camera.height, width), dtype=np.int8
+    )  # without light to tell apart no borders
     if lit is not None:
         state.ravel()[hits.pixels] = np.where(lit, 1, -1)
     borders = at_borders(state)
@@ -63,7 +71,8 @@ def mixed_pixels(
     wanted.ravel()[ray[within]] = True
     sub = traced.primary(fine, wanted)
     x, y = (axis.ravel()[np.where(within, ray, 0)] for axis in (fine.x, fine.y))
-    # Rays are sorted by pixel, hits by their place in the finer image: `of` is the hit of each ray, -1 for none.
+    # Rays are sorted by pixel, hits by their place in the finer image: `of` is the hit of each ray,
+    # -1 for none.
     of = np.full(ray.size, -1, dtype=np.int64)
     if sub.pixels.size:
         place = np.minimum(np.searchsorted(sub.pixels, ray), sub.pixels.size - 1)
@@ -71,9 +80,15 @@ def mixed_pixels(
     hit = of >= 0
     depth_m, triangle = np.full(ray.size, rig.background), np.full(ray.size, -1, dtype=np.int32)
     normals = np.tile([0.0, 0.0, -1.0], (ray.size, 1))
-    depth_m[hit], triangle[hit], normals[hit] = sub.depth_m[of[hit]], sub.triangle[of[hit]], sub.normals[of[hit]]
+    depth_m[hit], triangle[hit], normals[hit] = (
+        sub.depth_m[of[hit]],
+        sub.triangle[of[hit]],
+        sub.normals[of[hit]],
+    )
     seen = np.repeat(central[pixels], total)
-    same = ~hit  # on the surface that the central ray sees: the background, or near the object's plane there
+    same = (
+        ~hit
+    )  # on the surface that the central ray sees: the background, or near the object's plane there
     own = np.flatnonzero(seen >= 0)
     plane = n[seen[own]]
     plane_m = distance[seen[own]] / (plane[:, 0] * x[own] + plane[:, 1] * y[own] + plane[:, 2])
@@ -90,9 +105,10 @@ def mixed_pixels(
 
 @njit
 def mark_neighbours(width, central, pixels, depth_m, normals, distance, x, y, chosen):  # type: ignore[no-untyped-def]
-    """Mark in ``chosen`` bool (H W,) the pixels of which a neighbour sees another surface, or another side of an edge,
-    and that neighbour. ``central`` int64 (H W,): each pixel's row in the arrays of hits, -1 for none; ``distance`` (n,)
-    of the hits' planes from the camera; rays ``x`` and ``y`` (H W,)."""
+    """Mark in ``chosen`` bool (H W,) the pixels of which a neighbour sees another surface, or
+    another side of an edge, and that neighbour. ``central`` int64 (H W,): each pixel's row in the
+    arrays of hits, -1 for none; ``distance`` (n,) of the hits' planes from the camera; rays ``x``
+    and ``y`` (H W,)."""
     height = central.size // width
     for i in range(pixels.size):
         row, column = pixels[i] // width, pixels[i] % width
@@ -105,14 +121,17 @@ def mark_neighbours(width, central, pixels, depth_m, normals, distance, x, y, ch
                     a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
                     plane_m = distance[i] / (a * x[other] + b * y[other] + c)
                     turn = a * normals[j, 0] + b * normals[j, 1] + c * normals[j, 2]
-                    apart = not (abs(plane_m - depth_m[j]) * 1000.0 <= APART_MM and turn >= _EDGE_COSINE)
+                    apart = not (
+                        abs(plane_m - depth_m[j]) * 1000.0 <= APART_MM and turn >= _EDGE_COSINE
+                    )
                 if apart:
                     chosen[pixels[i]] = True
                     chosen[other] = True
 
 
 def at_borders(state: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """The pixels beside one, across or along, with the opposite sign of ``state`` (H, W); bool (H W,)."""
+    """The pixels beside one, across or along, with the opposite sign of ``state`` (H, W); bool (H
+    W,)."""
     border = np.zeros(state.shape, dtype=bool)
     for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         changes = state[one] * state[other] < 0
@@ -122,14 +141,18 @@ def at_borders(state: NDArray[np.int8]) -> NDArray[np.bool_]:
 
 
 def _fine_pixels(pixels: NDArray[np.int64], width: int, across: int) -> NDArray[np.int64]:
-    """Flat positions of the pixels' rays in the finer image, row by row of each pixel; int64 (m across^2,)."""
+    """Flat positions of the pixels' rays in the finer image, row by row of each pixel; int64 (m
+    across^2,)."""
     row, column = np.divmod(pixels, width)
     down, right = np.divmod(np.arange(across * across), across)
-    return ((row[:, None] * across + down) * (width * across) + column[:, None] * across + right).ravel()
+    return (
+        (row[:, None] * across + down) * (width * across) + column[:, None] * across + right
+    ).ravel()
 
 
 def vignetting(camera: Pinhole, power: int) -> NDArray[np.float32]:
-    """Share of the light that reaches each pixel, cos^power of its angle to the axis; float32 (H W,)."""
+    """Share of the light that reaches each pixel, cos^power of its angle to the axis; float32 (H
+    W,)."""
     x, y = (axis.ravel() for axis in camera.rays())
     cosine = 1.0 / np.sqrt(x * x + y * y + 1.0)
     share = np.ones_like(cosine)
@@ -140,8 +163,8 @@ def vignetting(camera: Pinhole, power: int) -> NDArray[np.float32]:
 
 @njit
 def blur_image(image, weights, between):  # type: ignore[no-untyped-def]
-    """Convolve ``image`` float32 (H, W) with ``weights`` (2 r + 1,) along both axes, in place; the border repeats.
-    ``between`` float32 (H, W) is overwritten."""
+    """Convolve ``image`` float32 (H, W) with ``weights`` (2 r + 1,) along both axes, in place; the
+    border repeats. ``between`` float32 (H, W) is overwritten."""
     height, width = image.shape
     reach = weights.size // 2
     for i in range(height):

@@ -1,8 +1,10 @@
-"""Which triangle a ray meets: a depth buffer for the camera's rays, a box tree for any other; compiled, in float64.
+"""Which triangle a ray meets: a depth buffer for the camera's rays, a box tree for any other;
+compiled, in float64.
 
-The signs of three edge functions, ``d . (a x b)`` for the edge from a to b seen from the ray's origin, decide:
-triangles that share an edge have exactly opposite values for it, so no ray passes between them. Without fastmath and
-fused multiply-add every processor gives the same answer (see `fpp_ml_bench.machine`).
+The signs of three edge functions, ``d . (a x b)`` for the edge from a to b seen from the ray's
+origin, decide: triangles that share an edge have exactly opposite values for it, so no ray passes
+between them. Without fastmath and fused multiply-add every processor gives the same answer (see
+`fpp_ml_bench.machine`).
 """
 
 import numpy as np
@@ -10,9 +12,11 @@ import numpy as np
 from fpp_ml_bench.machine import njit
 
 SLACK = 1e-9
-"""Boxes are widened by this, in m or normalised units: far above float64's rounding, far below a pixel."""
+"""Boxes are widened by this, in m or normalised units: far above float64's rounding, far below a
+pixel."""
 NARROWED_FROM_PX = 8
-"""From this width on the columns of a row that a triangle can cover are computed, and not just tried."""
+"""From this width on the columns of a row that a triangle can cover are computed, and not just
+tried."""
 _NEAR_M = 1e-6
 
 
@@ -20,11 +24,13 @@ _NEAR_M = 1e-6
 def rasterise(  # type: ignore[no-untyped-def]
     corners, normals, offsets, x, y, columns, rows, left, top, wanted, depth_m, triangle
 ):
-    """Nearest triangle of each pixel in a window, and its depth. Fills ``depth_m`` (inf before) and ``triangle`` (-1).
+    """Nearest triangle of each pixel in a window, and its depth. Fills ``depth_m`` (inf before) and
+    ``triangle`` (-1).
 
-    ``corners`` (F, 3, 3) in m, camera at the origin; unit ``normals`` (F, 3) and plane ``offsets`` (F,); rays ``x`` and
-    ``y`` (H, W), of which the window starts at column ``left`` and row ``top``. ``columns`` (2, W): the greatest x up
-    to each column, and the least x from it on; ``rows`` (2, H): the same of y. Only the rays ``wanted`` bool (H, W).
+    ``corners`` (F, 3, 3) in m, camera at the origin; unit ``normals`` (F, 3) and plane ``offsets``
+    (F,); rays ``x`` and ``y`` (H, W), of which the window starts at column ``left`` and row
+    ``top``. ``columns`` (2, W): the greatest x up to each column, and the least x from it on;
+    ``rows`` (2, H): the same of y. Only the rays ``wanted`` bool (H, W).
     """
     height, width = depth_m.shape
     reach_x = max(abs(columns[0, -1]), abs(columns[1, 0]))
@@ -32,9 +38,21 @@ def rasterise(  # type: ignore[no-untyped-def]
     for f in range(corners.shape[0]):
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
         # Edge functions: e_k = gx[k] x + gy[k] y + gz[k].
-        gx0, gy0, gz0 = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
-        gx1, gy1, gz1 = c[1] * a[2] - c[2] * a[1], c[2] * a[0] - c[0] * a[2], c[0] * a[1] - c[1] * a[0]
-        gx2, gy2, gz2 = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        gx0, gy0, gz0 = (
+            b[1] * c[2] - b[2] * c[1],
+            b[2] * c[0] - b[0] * c[2],
+            b[0] * c[1] - b[1] * c[0],
+        )
+        gx1, gy1, gz1 = (
+            c[1] * a[2] - c[2] * a[1],
+            c[2] * a[0] - c[0] * a[2],
+            c[0] * a[1] - c[1] * a[0],
+        )
+        gx2, gy2, gz2 = (
+            a[1] * b[2] - a[2] * b[1],
+            a[2] * b[0] - a[0] * b[2],
+            a[0] * b[1] - a[1] * b[0],
+        )
         nearest, farthest = min(a[2], b[2], c[2]), max(a[2], b[2], c[2])
         if farthest <= 0.0:
             continue
@@ -58,7 +76,11 @@ def rasterise(  # type: ignore[no-untyped-def]
                 low, high = -np.inf, np.inf
                 y_low, y_high = rows[1, top + row], rows[0, top + row]
                 for k in range(3):
-                    gx, gy, gz = (gx0, gy0, gz0) if k == 0 else ((gx1, gy1, gz1) if k == 1 else (gx2, gy2, gz2))
+                    gx, gy, gz = (
+                        (gx0, gy0, gz0)
+                        if k == 0
+                        else ((gx1, gy1, gz1) if k == 1 else (gx2, gy2, gz2))
+                    )
                     if turn < 0.0:
                         gx, gy, gz = -gx, -gy, -gz
                     rest = max(gy * y_low, gy * y_high) + gz
@@ -82,7 +104,8 @@ def rasterise(  # type: ignore[no-untyped-def]
                 inside |= (e0 <= 0.0) & (e1 <= 0.0) & (e2 <= 0.0)
                 if inside:
                     depth = offset / (nx * dx + ny * dy + nz)
-                    # A triangle that is seen edge-on has no depth of its own there, but it is bounded.
+                    # A triangle that is seen edge-on has no depth of its own there, but it is
+                    # bounded.
                     depth = min(max(depth, nearest), farthest) if np.isfinite(depth) else nearest
                     if 0.0 < depth < depth_m[row, column]:
                         depth_m[row, column] = depth
@@ -91,11 +114,13 @@ def rasterise(  # type: ignore[no-untyped-def]
 
 @njit
 def build_tree(corners, order, starts, boxes):  # type: ignore[no-untyped-def]
-    """An implicit binary tree over triangles ``corners`` (F, 3, 3): fills ``order``, ``starts`` and ``boxes``.
+    """An implicit binary tree over triangles ``corners`` (F, 3, 3): fills ``order``, ``starts`` and
+    ``boxes``.
 
-    Node k of ``boxes`` (2 L, 6), least x, y, z and greatest, has the children 2 k and 2 k + 1; the root is 1 and the L
-    leaves, a power of two, come last. Leaf j holds the triangles ``order[starts[j]:starts[j + 1]]``. Every node is
-    halved at the median of its triangles' centres along its longest side.
+    Node k of ``boxes`` (2 L, 6), least x, y, z and greatest, has the children 2 k and 2 k + 1; the
+    root is 1 and the L leaves, a power of two, come last. Leaf j holds the triangles
+    ``order[starts[j]:starts[j + 1]]``. Every node is halved at the median of its triangles' centres
+    along its longest side.
     """
     count, leaves = corners.shape[0], boxes.shape[0] // 2
     centres = np.empty((count, 3))
@@ -137,11 +162,13 @@ def build_tree(corners, order, starts, boxes):  # type: ignore[no-untyped-def]
 
 @njit
 def nearest_hit(corners, starts, boxes, origins, targets, any_suffices, along, triangle):  # type: ignore[no-untyped-def]
-    """The nearest triangle between each origin and its target, both (n, 3): fills ``triangle`` int32 (n,), -1 for none,
-    and ``along`` float64 (n,), its place as a share of the way, 1 for none. With ``any_suffices`` any triangle will do.
+    """The nearest triangle between each origin and its target, both (n, 3): fills ``triangle``
+    int32 (n,), -1 for none, and ``along`` float64 (n,), its place as a share of the way, 1 for
+    none. With ``any_suffices`` any triangle will do.
 
-    ``corners`` in the order of the tree (`build_tree`), which ``triangle`` counts in. The boxes only save work: they
-    are wider than what they hold, so the answer is that of all triangles; of two at the same place the earlier one.
+    ``corners`` in the order of the tree (`build_tree`), which ``triangle`` counts in. The boxes
+    only save work: they are wider than what they hold, so the answer is that of all triangles; of
+    two at the same place the earlier one.
     """
     leaves = boxes.shape[0] // 2
     stack = np.empty(64, np.int64)

@@ -1,8 +1,10 @@
-"""What a build is asked for, and where things stand: settings, and an object placed before the camera.
+"""What a build is asked for, and where things stand: settings, and an object placed before the
+camera.
 
-Two builds with equal settings give equal bytes. An object stands on its turning axis, at a fixed or a drawn distance.
-Object coordinates are metres with z up and the turning axis as z. Camera coordinates are the rig's: x right, y down,
-z forward. At angle 0 the object's +x axis points away from the camera (paper Section 3.1: R_z(60 degrees x i)).
+Two builds with equal settings give equal bytes. An object stands on its turning axis, at a fixed or
+a drawn distance. Object coordinates are metres with z up and the turning axis as z. Camera
+coordinates are the rig's: x right, y down, z forward. At angle 0 the object's +x axis points away
+from the camera (paper Section 3.1: R_z(60 degrees x i)).
 """
 
 from __future__ import annotations
@@ -36,8 +38,8 @@ _MARGIN_PX = 2.0
 
 @dataclass(frozen=True)
 class UserMesh:
-    """A mesh of the user's: file, scale, turn (degrees about x, y, z, in that order), shift, split, hash of
-    its bytes and its textures'."""
+    """A mesh of the user's: file, scale, turn (degrees about x, y, z, in that order), shift, split,
+    hash of its bytes and its textures'."""
 
     name: str
     path: str
@@ -53,11 +55,11 @@ class UserMesh:
 class BuildSettings:
     """Everything that decides the bytes of a dataset.
 
-    ``rig`` photographs. ``decode_with`` is what a calibration found of it: the ground truth is decoded with that rig,
-    and it is the dataset's, as in a lab.
+    ``rig`` photographs. ``decode_with`` is what a calibration found of it: the ground truth is
+    decoded with that rig, and it is the dataset's, as in a lab.
 
-    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's, the unseen ones and then the users' by name,
-    whatever order they were given in: it is the order of the rows.
+    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's, the unseen ones and then
+    the users' by name, whatever order they were given in: it is the order of the rows.
     """
 
     rig: Rig
@@ -92,8 +94,10 @@ class BuildSettings:
         self.rig.check_sampling()
         if not self.rig.directions:
             raise BuildError(
-                "this rig projects crossed fringes alone, from which no ground truth can be decoded; add the "
-                "horizontal or vertical code to its sequence (it need not be stored: --config crossed)"
+                "this rig projects crossed fringes alone, from which no ground truth can be "
+                "decoded; add the "
+                "horizontal or vertical code to its sequence (it need not be stored: --config "
+                "crossed)"
             )
         if not self.rig.sequence.config(self.stored):
             raise BuildError(f"frames {self.stored!r}: this rig's sequence has none of them")
@@ -106,13 +110,16 @@ class BuildSettings:
 
     @property
     def stated_rig(self) -> Rig:
-        """The rig that the dataset states: it decodes the ground truth, and methods get it. As after a calibration of
-        one's own, it says how large its error is."""
+        """The rig that the dataset states: it decodes the ground truth, and methods get it. As
+        after a calibration of one's own, it says how large its error is."""
         rig = self.rig if self.decode_with is None else self.decode_with
-        return replace(rig, calibration_px=math.hypot(rig.calibration_px, self.light.calibration_px))
+        return replace(
+            rig, calibration_px=math.hypot(rig.calibration_px, self.light.calibration_px)
+        )
 
     def describe(self) -> dict[str, Any]:
-        """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
+        """The settings as plain data for the manifest and for comparing an interrupted build with
+        this one."""
         described = {
             "objects": list(self.objects),
             "placement": self.placement,
@@ -128,44 +135,54 @@ class BuildSettings:
                 for mesh in self.user_meshes
             ],
         }
-        return described if self.decode_with is None else {**described, PHOTOGRAPHED_BY: self.rig.to_dict()}
+        return (
+            described
+            if self.decode_with is None
+            else {**described, PHOTOGRAPHED_BY: self.rig.to_dict()}
+        )
 
 
 def _check_same_devices(rig: Rig, other: Rig) -> None:
     """Raise `BuildError` where frames that ``rig`` takes can't be decoded by ``other``."""
     for device in ("camera", "projector"):
-        sizes = [(part.width, part.height) for part in (getattr(rig, device), getattr(other, device))]
+        sizes = [
+            (part.width, part.height) for part in (getattr(rig, device), getattr(other, device))
+        ]
         if sizes[0] != sizes[1]:
             (w, h), (other_w, other_h) = sizes
             raise BuildError(
-                f"the rig to decode with has a {device} of {other_w} x {other_h} px, and the one that photographs "
+                f"the rig to decode with has a {device} of {other_w} x {other_h} px, and the one "
+                f"that photographs "
                 f"{w} x {h} px; calibrate at the size that is built"
             )
     codes = [[one.code(direction) for direction in one.directions] for one in (rig, other)]
     if list(rig.sequence) != list(other.sequence) or codes[0] != codes[1]:
         raise BuildError(
-            "the rig to decode with has another sequence or pitch than the one that photographs; give both the same "
+            "the rig to decode with has another sequence or pitch than the one that photographs; "
+            "give both the same "
             "pitch_px and sequence"
         )
 
 
-def preset_settings(preset: str, size: int | None = None, light: str = "paper", rig: str = "paper") -> BuildSettings:
-    """The settings of ``fpp-bench build --preset PRESET [--size SIZE] [--light LIGHT] [--rig RIG]``, all else at its
-    default."""
+def preset_settings(
+    preset: str, size: int | None = None, light: str = "paper", rig: str = "paper"
+) -> BuildSettings:
+    """The settings of ``fpp-bench build --preset PRESET [--size SIZE] [--light LIGHT] [--rig
+    RIG]``, all else at its default."""
     objects, preset_size = PRESETS[preset]
     named = NAMED_RIGS[rig](size or preset_size)
     return BuildSettings(named, objects, stored=default_frames(rig), light=named_light(light))
 
 
 def default_frames(rig: str) -> str:
-    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--config`` says otherwise: of a crossed
-    rig its crossed frames, of any other all frames."""
+    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--config`` says
+    otherwise: of a crossed rig its crossed frames, of any other all frames."""
     return "crossed" if rig in NAMED_RIGS and rig != "paper" else "all"
 
 
 def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> float:
-    """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what white adds there,
-    by the inverse square of the distance, at the least exposure of a view."""
+    """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what
+    white adds there, by the inverse square of the distance, at the least exposure of a view."""
     camera = (light or named_light("paper")).camera
     exposure = camera.exposure[0] if isinstance(camera.exposure, tuple) else camera.exposure
     return exposure * camera.reference_grey / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
@@ -173,8 +190,9 @@ def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> floa
 
 @dataclass(frozen=True, eq=False)
 class SolidMesh:
-    """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32 (F, 3), and the
-    albedo of its own that a user's mesh may have, by triangle. Equal to itself alone."""
+    """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32
+    (F, 3), and the albedo of its own that a user's mesh may have, by triangle. Equal to itself
+    alone."""
 
     name: str
     vertices_m: NDArray[np.float64]
@@ -183,28 +201,41 @@ class SolidMesh:
 
 
 def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
-    """The rig that photographs where ``rig`` is its calibration: the projector turned and its principal point shifted,
-    so that points in the working range land ``calibration_px`` (RMS) beside where the calibration puts them."""
+    """The rig that photographs where ``rig`` is its calibration: the projector turned and its
+    principal point shifted, so that points in the working range land ``calibration_px`` (RMS)
+    beside where the calibration puts them."""
     if calibration_px == 0:
         return rig
     draws = [2 * uniform(seed, "calibration", part) - 1 for part in ("x", "y", "z", "u", "v")]
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
-    across, down = ((np.arange(16) + 0.5) * (length / 16) - 0.5 for length in (rig.camera.width, rig.camera.height))
+    across, down = (
+        (np.arange(16) + 0.5) * (length / 16) - 0.5
+        for length in (rig.camera.width, rig.camera.height)
+    )
     x, y = (axis.ravel() for axis in rig.camera.normalised(*np.meshgrid(across, down)))
     points = np.concatenate([along_rays(x, y, depth) for depth in (near_m, far_m)])
     before = rig.project(points)
     scale = 1.0 / rig.projector.fx
     for _ in range(3):  # displacements are all but linear in the scale
         turn = np.array(draws[:3]) * (scale / 2)
-        cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+        cross = np.array(
+            [[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]]
+        )
         small = np.eye(3) + 2.0 / (1.0 + float((turn * turn).sum())) * (
             cross + matrix_product(cross, cross)
         )  # Cayley's formula
-        shifted = {"cx": draws[3] * scale * rig.projector.fx, "cy": draws[4] * scale * rig.projector.fx}
-        projector = replace(rig.projector, cx=rig.projector.cx + shifted["cx"], cy=rig.projector.cy + shifted["cy"])
+        shifted = {
+            "cx": draws[3] * scale * rig.projector.fx,
+            "cy": draws[4] * scale * rig.projector.fx,
+        }
+        projector = replace(
+            rig.projector, cx=rig.projector.cx + shifted["cx"], cy=rig.projector.cy + shifted["cy"]
+        )
         first, second, third = (tuple(row) for row in matrix_product(small, rig.R).tolist())
         tx, ty, tz = matrix_product(small, rig.t[:, None]).ravel().tolist()
-        other = replace(rig, projector=projector, rotation=(first, second, third), translation_m=(tx, ty, tz))
+        other = replace(
+            rig, projector=projector, rotation=(first, second, third), translation_m=(tx, ty, tz)
+        )
         u, v = other.project(points)
         squares = (u - before[0]) ** 2 + (v - before[1]) ** 2
         scale *= calibration_px / float(np.sqrt(np.nanmean(squares)))
@@ -222,7 +253,8 @@ def uniform(*name: object) -> float:
 
 
 def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
-    """Vertices after R_z(degrees), along the camera's axes but still about the turning axis; (V, 3) metres."""
+    """Vertices after R_z(degrees), along the camera's axes but still about the turning axis; (V, 3)
+    metres."""
     cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
     x = cosine * vertices_m[:, 0] - sine * vertices_m[:, 1]
     y = sine * vertices_m[:, 0] + cosine * vertices_m[:, 1]
@@ -230,21 +262,27 @@ def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float6
 
 
 def unturned(points_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
-    """The inverse of `turned`: object coordinates of points (n, 3) about the turning axis along the camera's axes."""
+    """The inverse of `turned`: object coordinates of points (n, 3) about the turning axis along the
+    camera's axes."""
     cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
     x, y = points_m[:, 2], -points_m[:, 0]
     return np.column_stack([cosine * x + sine * y, cosine * y - sine * x, -points_m[:, 1]])
 
 
-def along_rays(x: NDArray[np.float64], y: NDArray[np.float64], depth_m: NDArray[np.float64] | float) -> NDArray:
-    """Points at a depth, a number or (n,), on the rays (x, y, 1), (n,) each; float64 (n, 3) in metres."""
+def along_rays(
+    x: NDArray[np.float64], y: NDArray[np.float64], depth_m: NDArray[np.float64] | float
+) -> NDArray:
+    """Points at a depth, a number or (n,), on the rays (x, y, 1), (n,) each; float64 (n, 3) in
+    metres."""
     return np.column_stack([x, y, np.ones_like(x)]) * np.reshape(depth_m, (-1, 1))
 
 
 def distance_bounds_m(about_axis_m: NDArray[np.float64], rig: Rig) -> tuple[float, float]:
-    """Nearest and farthest distance of the turning axis that keeps a turned object in range and inside the image.
+    """Nearest and farthest distance of the turning axis that keeps a turned object in range and
+    inside the image.
 
-    ``about_axis_m`` (V, 3) from `turned`. The bounds may be crossed (near > far): then the object fits nowhere.
+    ``about_axis_m`` (V, 3) from `turned`. The bounds may be crossed (near > far): then the object
+    fits nowhere.
     """
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
     camera = rig.camera
@@ -259,12 +297,15 @@ def distance_bounds_m(about_axis_m: NDArray[np.float64], rig: Rig) -> tuple[floa
     return float(max(needs)), float(far_m - z.max())
 
 
-def place(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int) -> tuple[NDArray[np.float64], float]:
-    """Vertices in camera coordinates (V, 3) in metres, and the distance of the turning axis in metres.
+def place(
+    mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int
+) -> tuple[NDArray[np.float64], float]:
+    """Vertices in camera coordinates (V, 3) in metres, and the distance of the turning axis in
+    metres.
 
-    ``fixed`` puts the axis at the rig's standoff; ``varied`` draws the distance, seeded by (seed, object, view), over
-    all that keeps the object within the working range and the image. Raises `MeshError` for an object that does not
-    fit, with the scale at which it would in every view.
+    ``fixed`` puts the axis at the rig's standoff; ``varied`` draws the distance, seeded by (seed,
+    object, view), over all that keeps the object within the working range and the image. Raises
+    `MeshError` for an object that does not fit, with the scale at which it would in every view.
     """
     about_axis_m = turned(mesh.vertices_m, VIEW_DEGREES[VIEWS.index(view)])
     nearest_m, farthest_m = distance_bounds_m(about_axis_m, rig)
@@ -273,7 +314,9 @@ def place(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int) 
         distance_m = rig.standoff_m
         fits = nearest_m - tolerance_m <= distance_m <= farthest_m + tolerance_m
     else:
-        distance_m = nearest_m + (farthest_m - nearest_m) * uniform(seed, mesh.name, view, "distance")
+        distance_m = nearest_m + (farthest_m - nearest_m) * uniform(
+            seed, mesh.name, view, "distance"
+        )
         fits = nearest_m <= farthest_m
     if not fits:
         raise MeshError(_misfit(mesh, view, rig, rule))
@@ -282,33 +325,52 @@ def place(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int) 
 
 _OTHER_UNITS_M = (0.001, "mm"), (0.01, "cm"), (0.0254, "inches")
 _SMALLEST_PART_M = 0.02
-"""A mesh is proposed in a unit in which it is as large as this or larger: 25 pixels of the paper's rig."""
+"""A mesh is proposed in a unit in which it is as large as this or larger: 25 pixels of the paper's
+rig."""
 
 
 def _misfit(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule) -> str:
     size = " x ".join(f"{extent:.3f}" for extent in np.ptp(mesh.vertices_m, axis=0))
     near_mm, far_mm = rig.working_range_mm
-    where = f"with its turning axis {rig.standoff_m} m from the camera" if rule == "fixed" else "at any distance"
+    where = (
+        f"with its turning axis {rig.standoff_m} m from the camera"
+        if rule == "fixed"
+        else "at any distance"
+    )
     scale = _largest_scale(mesh, rig, rule)
-    advice = f"scale it, offset included, by {scale:g} or less" if scale > 0 else "no scale makes it fit: move it"
+    advice = (
+        f"scale it, offset included, by {scale:g} or less"
+        if scale > 0
+        else "no scale makes it fit: move it"
+    )
     largest_m = np.ptp(mesh.vertices_m, axis=0).max()
-    units = [(size, unit) for size, unit in _OTHER_UNITS_M if size <= scale and size * largest_m >= _SMALLEST_PART_M]
+    units = [
+        (size, unit)
+        for size, unit in _OTHER_UNITS_M
+        if size <= scale and size * largest_m >= _SMALLEST_PART_M
+    ]
     if units:
         listed = " or ".join(f"{size:g} for {unit}" for size, unit in units)
-        advice += f" (if its numbers are no metres, list it in a file for --meshes with scale: {listed})"
+        advice += (
+            f" (if its numbers are no metres, list it in a file for --meshes with scale: {listed})"
+        )
     return (
-        f"object {mesh.name!r} ({size} m) does not fit the working range {near_mm:g}-{far_mm:g} mm and the image in "
+        f"object {mesh.name!r} ({size} m) does not fit the working range {near_mm:g}-{far_mm:g} mm "
+        f"and the image in "
         f"view {view} {where}; {advice}, or give a rig with a wider range"
     )
 
 
 def _largest_scale(mesh: SolidMesh, rig: Rig, rule: PlacementRule) -> float:
-    """Factor up to 1 at which the mesh fits in every view, rounded down to three digits; 0 if none does."""
+    """Factor up to 1 at which the mesh fits in every view, rounded down to three digits; 0 if none
+    does."""
     views = [turned(mesh.vertices_m, degrees) for degrees in VIEW_DEGREES]
 
     def fits(scale: float) -> bool:
         bounds = (distance_bounds_m(about_axis_m * scale, rig) for about_axis_m in views)
-        return all(near <= (rig.standoff_m if rule == "fixed" else far) <= far for near, far in bounds)
+        return all(
+            near <= (rig.standoff_m if rule == "fixed" else far) <= far for near, far in bounds
+        )
 
     low, high = 0.0, 1.0
     for _ in range(40):

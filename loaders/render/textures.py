@@ -1,7 +1,9 @@
-"""Albedo maps: what is printed on an object, grows in it or has stained it, as functions of the place on its surface.
+"""Albedo maps: what is printed on an object, grows in it or has stained it, as functions of the
+place on its surface.
 
-They are functions of object coordinates, so that a map sticks to its object in every view, and of the object's name.
-Prints lie on the two axes that the surface faces least; wood and stains fill space.
+They are functions of object coordinates, so that a map sticks to its object in every view, and of
+the object's name. Prints lie on the two axes that the surface faces least; wood and stains fill
+space.
 """
 
 from collections.abc import Callable
@@ -95,8 +97,9 @@ def material_of(
     surface: SurfaceLight,
     triangle: NDArray[np.integer] | None = None,
 ) -> Material:
-    """Albedo and gloss of a mesh at surface points (n, 3) with unit normals (n, 3), object coordinates, on triangles
-    ``triangle`` (n,) of it. Where a light has textures, a mesh with colours of its own has those and no map."""
+    """Albedo and gloss of a mesh at surface points (n, 3) with unit normals (n, 3), object
+    coordinates, on triangles ``triangle`` (n,) of it. Where a light has textures, a mesh with
+    colours of its own has those and no map."""
     albedo = surface.albedo * surface.object_share
     if surface.textures == "none":
         return Material(albedo, surface.gloss)
@@ -150,9 +153,17 @@ def wood(position_mm: Values, normal: Values, name: str) -> Values:
 
 def stains(position_mm: Values, normal: Values, name: str) -> Values:
     """Soft blotches, and a little grain."""
-    blotch = smooth_noise(position_mm / STAIN_MM, name) + 0.5 * smooth_noise(position_mm / (STAIN_MM / 3), name) - 0.25
+    blotch = (
+        smooth_noise(position_mm / STAIN_MM, name)
+        + 0.5 * smooth_noise(position_mm / (STAIN_MM / 3), name)
+        - 0.25
+    )
     share = np.clip((blotch - 0.4) / 0.3, 0.0, 1.0)
-    return np.clip(0.85 * share * share * (3.0 - 2.0 * share) + 0.15 * smooth_noise(position_mm / 2.0, name), 0.0, 1.0)
+    return np.clip(
+        0.85 * share * share * (3.0 - 2.0 * share) + 0.15 * smooth_noise(position_mm / 2.0, name),
+        0.0,
+        1.0,
+    )
 
 
 MAPS: dict[str, Callable[[Values, Values, str], Values]] = {
@@ -162,11 +173,13 @@ MAPS: dict[str, Callable[[Values, Values, str], Values]] = {
     "wood": wood,
     "stains": stains,
 }
-"""How dark each map is, from 0 to 1, at places in mm (n, 3) with unit normals (n, 3), by the object's name; (n,)."""
+"""How dark each map is, from 0 to 1, at places in mm (n, 3) with unit normals (n, 3), by the
+object's name; (n,)."""
 
 
 def _on_paper(position_mm: Values, normal: Values) -> tuple[Values, Values]:
-    """Coordinates to the right and down, in mm, as if each surface were printed from the side that it faces most."""
+    """Coordinates to the right and down, in mm, as if each surface were printed from the side that
+    it faces most."""
     x, y, z = position_mm.T
     facing = np.abs(normal).argmax(axis=1)
     side, top = np.where(facing == 0, y, x), facing == 2
@@ -188,7 +201,8 @@ def _hash(a: Values, b: Values, c: Values, name: str) -> NDArray[np.uint32]:
 
 
 def smooth_noise(place: Values, name: str) -> Values:
-    """Noise in [0, 1] that changes over a length of 1: a hash of the corners of each unit cell, blended smoothly."""
+    """Noise in [0, 1] that changes over a length of 1: a hash of the corners of each unit cell,
+    blended smoothly."""
     cell = np.floor(place)
     share = place - cell
     share = share * share * (3.0 - 2.0 * share)
@@ -199,6 +213,11 @@ def smooth_noise(place: Values, name: str) -> Values:
                 weight = np.ones(len(place))
                 for axis, corner in enumerate((dx, dy, dz)):
                     weight = weight * (share[:, axis] if corner else 1.0 - share[:, axis])
-                value = _hash(cell[:, 0] + dx, cell[:, 1] + dy, cell[:, 2] + dz, name).astype(np.float64) / 2.0**32
+                value = (
+                    _hash(cell[:, 0] + dx, cell[:, 1] + dy, cell[:, 2] + dz, name).astype(
+                        np.float64
+                    )
+                    / 2.0**32
+                )
                 total += weight * value
     return total

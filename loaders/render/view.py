@@ -1,4 +1,5 @@
-"""One view of one object, from mesh to sample: frames, decoded ground truth, exact depth, and what separates them."""
+"""One view of one object, from mesh to sample: frames, decoded ground truth, exact depth, and what
+separates them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,22 +16,31 @@ from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.lighting import Lighting
 from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pixels, vignetting
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, along_rays, photographing_rig, place, uniform
+from fpp_ml_bench.loaders.render.scene import (
+    BuildSettings,
+    SolidMesh,
+    along_rays,
+    photographing_rig,
+    place,
+    uniform,
+)
 from fpp_ml_bench.loaders.render.sensor import Exposure
 from fpp_ml_bench.loaders.sample import WEAK_GREY, Flag, Row, stored_frames, void_pixels
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 from fpp_ml_bench.skipping import skipping_enabled
 
 INTERIOR_PX = 3
-"""Ground-truth error is told apart at this distance from a depth edge: nearer, a pixel is a matter of definition."""
+"""Ground-truth error is told apart at this distance from a depth edge: nearer, a pixel is a matter
+of definition."""
 STRONG_SHARE = 0.25
 """Light of further bounces over direct light, under white, from which a pixel is flagged."""
 
 
 @dataclass(frozen=True)
 class TracedView:
-    """An object before the camera: what the rays meet, the light of the object's pixels and of the pixels that mix
-    surfaces (three arrays of `LitPixels` each as long as their rays), and the name of the view's noise stream."""
+    """An object before the camera: what the rays meet, the light of the object's pixels and of the
+    pixels that mix surfaces (three arrays of `LitPixels` each as long as their rays), and the name
+    of the view's noise stream."""
 
     traced: TracedObject
     distance_m: float
@@ -59,7 +69,8 @@ class Studio:
         self._vignetting = vignetting(camera, falloff) if falloff else None
         self._lens = gaussian_weights(blur_px**2, 3.0).astype(np.float32) if blur_px else None
         self.stored = stored_frames(rig.sequence, settings.stored)
-        # Frames that the ground truth is decoded from and that are not stored: all others, mostly but black and white.
+        # Frames that the ground truth is decoded from and that are not stored: all others, mostly
+        # but black and white.
         flat = any(rig.code(direction).needs_flat for direction in rig.directions)
         black_and_white = () if flat else (rig.sequence.black, rig.sequence.white)
         unneeded = {*self.stored, *rig.sequence.crossed_frames, *black_and_white}
@@ -67,23 +78,30 @@ class Studio:
         self._frames = np.zeros((len(rig.sequence), camera.height, camera.width), dtype=np.uint8)
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
-        """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call overwrites.
+        """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call
+        overwrites.
 
-        Raises `MeshError` for an object that is on no pixel, `BuildError` where none of its pixels can be decoded.
-        Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
-        pixels alone, and decoded there alone: the bytes there, and so the decoded depth, are the same either way. With
-        skipping off (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
+        Raises `MeshError` for an object that is on no pixel, `BuildError` where none of its pixels
+        can be decoded. Frames that are stored are exposed whole. Those that only the ground truth
+        needs are exposed at the object's pixels alone, and decoded there alone: the bytes there,
+        and so the decoded depth, are the same either way. With skipping off
+        (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
         """
         scene = self.trace(mesh, view)
         shadow_rays = self.expose_view(mesh, view, scene)
         exact_mm = self.exact_mm(scene)
         depth_mm = self.ground_truth_mm(object_mask(exact_mm))
         if not depth_mm.any():
-            counts = decode_stack(self._frames, self.settings.stated_rig, mask=object_mask(exact_mm)).counts
+            counts = decode_stack(
+                self._frames, self.settings.stated_rig, mask=object_mask(exact_mm)
+            ).counts
             counts["not_asked"] = 0
-            reasons = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items() if count)
+            reasons = ", ".join(
+                f"{name.replace('_', ' ')} {count}" for name, count in counts.items() if count
+            )
             raise BuildError(
-                f"sample {sample_name(mesh.name, view)!r}: none of its {len(scene.hits.pixels)} object pixels can be "
+                f"sample {sample_name(mesh.name, view)!r}: none of its {len(scene.hits.pixels)} "
+                f"object pixels can be "
                 f"decoded ({reasons}); check the rig's pose and code, and how bright --light is"
             )
         flags, cover = self.flags(scene)
@@ -91,9 +109,21 @@ class Studio:
         measured["mixed_rays"] = 0 if scene.mixed is None else len(scene.mixed.points_m)
         measured |= ground_truth_error(depth_mm, exact_mm, flags)
         frames = {index: self._frames[index] for index in self.stored}
-        return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured, flags, cover)
+        return Row(
+            sample_name(mesh.name, view),
+            mesh.name,
+            view,
+            frames,
+            depth_mm,
+            exact_mm,
+            measured,
+            flags,
+            cover,
+        )
 
-    def trace(self, mesh: SolidMesh, view: str, moved_m: NDArray[np.float64] | None = None) -> TracedView:
+    def trace(
+        self, mesh: SolidMesh, view: str, moved_m: NDArray[np.float64] | None = None
+    ) -> TracedView:
         """The object in its place, or ``moved_m`` (3,) from there, seen and lit."""
         settings, rig, light = self.settings, self.rig, self.light
         vertices_m, distance_m = place(mesh, view, settings.rig, settings.placement, settings.seed)
@@ -106,8 +136,10 @@ class Studio:
             size_mm = MM_PER_M * float(np.ptp(vertices_m, axis=0).max())
             pixel_mm = MM_PER_M * distance_m / rig.camera.fx
             raise MeshError(
-                f"object {mesh.name!r} is on no pixel in view {view}: it is {size_mm:.3g} mm large, and a pixel "
-                f"{distance_m:g} m from the camera is {pixel_mm:.3g} mm; scale it up, or build with more px (--size)"
+                f"object {mesh.name!r} is on no pixel in view {view}: it is {size_mm:.3g} mm "
+                f"large, and a pixel "
+                f"{distance_m:g} m from the camera is {pixel_mm:.3g} mm; scale it up, or build "
+                f"with more px (--size)"
             )
         stream = (settings.seed, mesh.name, view)
         object_light = self.lighting.upon(mesh, traced, VIEW_DEGREES[VIEWS.index(view)], offset_m)
@@ -119,7 +151,9 @@ class Studio:
             shaded = lit.gain > 0 if light.bounces.shadows else None
             mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across, shaded)
             mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.triangle)
-        return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self.brightness(stream), stream)
+        return TracedView(
+            traced, distance_m, hits, lit, mixed, mixed_lit, self.brightness(stream), stream
+        )
 
     def exact_mm(self, scene: TracedView) -> NDArray[np.float32]:
         """Exact depth (H, W) of what the camera sees of the object, 0 beyond."""
@@ -133,28 +167,40 @@ class Studio:
         if isinstance(exposure, tuple):
             low, high = exposure
             exposure = low / float(power(np.array([low / high]), uniform(*stream, "exposure"))[0])
-        return np.float32(exposure) if self._vignetting is None else self._vignetting * np.float32(exposure)
+        return (
+            np.float32(exposure)
+            if self._vignetting is None
+            else self._vignetting * np.float32(exposure)
+        )
 
     def expose_view(self, mesh: SolidMesh, view: str, scene: TracedView) -> int:
         """Expose a view into the studio's frames; returns how many shadow rays its light took."""
-        frames = tuple(range(len(self._frames))) if not skipping_enabled() else self.stored + self.unstored
+        frames = (
+            tuple(range(len(self._frames)))
+            if not skipping_enabled()
+            else self.stored + self.unstored
+        )
         if self.light.motion_mm == 0:
             return self.expose(scene, frames)
         return self.expose_moving(mesh, view, {frame: frame for frame in frames})
 
     def expose_moving(self, mesh: SolidMesh, view: str, steps: Mapping[int, float]) -> int:
-        """Expose frames of an object that moves: each at so many steps of ``motion_mm`` from its place, all in one
-        direction drawn for the view. Returns how many shadow rays their light took."""
+        """Expose frames of an object that moves: each at so many steps of ``motion_mm`` from its
+        place, all in one direction drawn for the view. Returns how many shadow rays their light
+        took."""
         stream = (self.settings.seed, mesh.name, view)
         height, turn = 2 * uniform(*stream, "height") - 1, uniform(*stream, "turn")
         level = np.sqrt(1 - height * height)
         direction = np.array([level * cosine_of_turns(turn), height, level * sine_of_turns(turn)])
         step_m = direction * (self.light.motion_mm / MM_PER_M)
-        return sum(self.expose(self.trace(mesh, view, step_m * step), (frame,)) for frame, step in steps.items())
+        return sum(
+            self.expose(self.trace(mesh, view, step_m * step), (frame,))
+            for frame, step in steps.items()
+        )
 
     def expose(self, scene: TracedView, frames: tuple[int, ...]) -> int:
-        """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels alone, unless it moves
-        or the lens blurs. Returns how many shadow rays their light took."""
+        """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels
+        alone, unless it moves or the lens blurs. Returns how many shadow rays their light took."""
         exposure, images = self.exposure, self._frames.reshape(len(self._frames), -1)
         behind = self.lighting.behind(scene.traced, scene.hits.pixels)
         parts = [(scene.hits.pixels, scene.lit)]
@@ -164,7 +210,10 @@ class Studio:
         plain = np.ndim(scene.brightness) == 0 and scene.brightness == 1
         if not plain:
             behind = behind.brighter(scene.brightness)
-            parts = [(pixels, lit.brighter(self._of(scene.brightness, pixels, lit))) for pixels, lit in parts]
+            parts = [
+                (pixels, lit.brighter(self._of(scene.brightness, pixels, lit)))
+                for pixels, lit in parts
+            ]
         if self._lens is not None:
             image, between = np.empty((2, *self._frames.shape[1:]), dtype=np.float32)
             for frame in frames:
@@ -173,13 +222,23 @@ class Studio:
                     light = np.empty((1, pixels.size), dtype=np.float32)
                     image.ravel()[pixels] = exposure.radiance((frame,), lit, scene.stream, light)[0]
                 blur_image(image, self._lens, between)
-                exposure.sense((frame,), image.reshape(1, -1), self._pixels, scene.stream, images[frame : frame + 1])
+                exposure.sense(
+                    (frame,),
+                    image.reshape(1, -1),
+                    self._pixels,
+                    scene.stream,
+                    images[frame : frame + 1],
+                )
             return shadow_rays
         # An object that moves leaves pixels of the first frame, where all are decoded.
         everything = not skipping_enabled() or self.light.motion_mm > 0
         whole = tuple(frame for frame in frames if everything or frame not in self.unstored)
-        for run in np.split(whole, np.flatnonzero(np.diff(whole) > 1) + 1) if whole else ():  # runs of neighbours
-            exposure.expose(run.tolist(), behind, self._pixels, scene.stream, images[run[0] : run[-1] + 1])
+        for run in (
+            np.split(whole, np.flatnonzero(np.diff(whole) > 1) + 1) if whole else ()
+        ):  # runs of neighbours
+            exposure.expose(
+                run.tolist(), behind, self._pixels, scene.stream, images[run[0] : run[-1] + 1]
+            )
         for pixels, lit in parts:
             exposed = exposure.expose(frames, lit, pixels.astype(np.uint32), scene.stream)
             for index, values in zip(frames, exposed, strict=True):
@@ -187,7 +246,8 @@ class Studio:
         return shadow_rays
 
     def frame(self, index: int) -> NDArray[np.uint8]:
-        """The frame ``index`` as it was exposed last, uint8 (H, W); overwritten by the next view."""
+        """The frame ``index`` as it was exposed last, uint8 (H, W); overwritten by the next
+        view."""
         return self._frames[index]
 
     @staticmethod
@@ -200,25 +260,35 @@ class Studio:
         return brightness
 
     def flags(self, scene: TracedView) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """What is special about each pixel (`Flag`), and the share of it that the surface of its central ray covers,
-        in 255ths; uint8 (H, W) each."""
+        """What is special about each pixel (`Flag`), and the share of it that the surface of its
+        central ray covers, in 255ths; uint8 (H, W) each."""
         shape, pixels, lit = self._frames.shape[1:], scene.hits.pixels, scene.lit
-        flags, cover = np.zeros(self._pixels.size, dtype=np.uint8), np.full(self._pixels.size, 255, dtype=np.uint8)
+        flags, cover = (
+            np.zeros(self._pixels.size, dtype=np.uint8),
+            np.full(self._pixels.size, 255, dtype=np.uint8),
+        )
         flags[pixels[lit.gain == 0]] |= np.uint8(Flag.UNLIT)
         bounced = np.zeros_like(lit.gain) if lit.bounced is None else self._of_white(lit.bounced)
         white = (lit.gain + lit.ambient + bounced) * self._of(scene.brightness, pixels, lit)
-        flags[pixels[white + self.light.camera.black_grey >= GREY_LEVELS]] |= np.uint8(Flag.SATURATED)
-        flags[pixels[(bounced > STRONG_SHARE * lit.gain) & (lit.gain > 0)]] |= np.uint8(Flag.INTERREFLECTION)
+        flags[pixels[white + self.light.camera.black_grey >= GREY_LEVELS]] |= np.uint8(
+            Flag.SATURATED
+        )
+        flags[pixels[(bounced > STRONG_SHARE * lit.gain) & (lit.gain > 0)]] |= np.uint8(
+            Flag.INTERREFLECTION
+        )
         fringes = lit.gain * self._of(scene.brightness, pixels, lit) / 2
-        flags[pixels[(lit.gain > 0) & ((fringes < WEAK_GREY) | (bounced > lit.gain))]] |= np.uint8(Flag.WEAK)
+        flags[pixels[(lit.gain > 0) & ((fringes < WEAK_GREY) | (bounced > lit.gain))]] |= np.uint8(
+            Flag.WEAK
+        )
         if scene.mixed is not None:
             flags[scene.mixed.pixels[scene.mixed.void]] |= np.uint8(Flag.MIXED)
             cover[scene.mixed.pixels] = np.rint(255 * scene.mixed.share).astype(np.uint8)
         return flags.reshape(shape), cover.reshape(shape)
 
     def _of_white(self, bounced: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What white light would bring, of what each frame's brings, float32 (F, n): without a white frame twice the
-        mean of the fringes, whose steps add up to half of it, or of Gray frames and their inverses."""
+        """What white light would bring, of what each frame's brings, float32 (F, n): without a
+        white frame twice the mean of the fringes, whose steps add up to half of it, or of Gray
+        frames and their inverses."""
         sequence = self.rig.sequence
         if sequence.white is not None:
             return bounced[sequence.white]  # type: ignore[no-any-return]
@@ -227,21 +297,26 @@ class Studio:
         return 2 * bounced[fringes].mean(axis=0)  # type: ignore[no-any-return]
 
     def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32 (H, W), 0 beyond."""
+        """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32
+        (H, W), 0 beyond."""
         rig = self.settings.stated_rig
         if skipping_enabled():
             return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
-        return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))
+        return np.where(
+            seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0)
+        )
 
 
 def ground_truth_error(
     depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float32], flags: NDArray[np.uint8]
 ) -> dict[str, Any]:
-    """How far the decoded ground truth is from the exact one, per sample; mm and pixel counts, sums in float64.
+    """How far the decoded ground truth is from the exact one, per sample; mm and pixel counts, sums
+    in float64.
 
-    Over pixels that both have and that are not void: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``, ``gt_max_mm``, and
-    the first two again for pixels at least 3 px from a depth edge (``gt_interior_*``). ``undecoded_px`` counts object
-    pixels without a decoded depth, which are background in ``depth``; the others pixels by their `Flag`.
+    Over pixels that both have and that are not void: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``,
+    ``gt_max_mm``, and the first two again for pixels at least 3 px from a depth edge
+    (``gt_interior_*``). ``undecoded_px`` counts object pixels without a decoded depth, which are
+    background in ``depth``; the others pixels by their `Flag`.
     """
     seen, decoded = object_mask(exact_mm), object_mask(depth_mm)
     void = void_pixels(flags)

@@ -1,10 +1,12 @@
-"""The benchmarks that this package names, and what is known of each: its samples and objects, how many pixels count,
-and hashes of its content. A result is only comparable with results on the same content.
+"""The benchmarks that this package names, and what is known of each: its samples and objects, how
+many pixels count, and hashes of its content. A result is only comparable with results on the same
+content.
 
-Content is a hash of the decoded values for each column of each split (`Manifest.content`), the same on every processor.
-Files, paths and versions of the format do not enter it, so that a build that lacks columns is still the benchmark for
-the methods that don't need them. A change of the content is a new version. The facts are in ``benchmarks/NAME.json``;
-``benchmarks/benchmark_facts.py`` writes them from a build.
+Content is a hash of the decoded values for each column of each split (`Manifest.content`), the same
+on every processor. Files, paths and versions of the format do not enter it, so that a build that
+lacks columns is still the benchmark for the methods that don't need them. A change of the content
+is a new version. The facts are in ``benchmarks/NAME.json``; ``benchmarks/benchmark_facts.py``
+writes them from a build.
 """
 
 import json
@@ -21,8 +23,9 @@ FACTS = Path(__file__).resolve().parent / "benchmarks"
 
 
 class Counts(NamedTuple):
-    """Samples of an object; over all of them its pixels that are object, None where that is not known, and void; and in
-    how many of them the object or the background has no pixel, none of a benchmark's."""
+    """Samples of an object; over all of them its pixels that are object, None where that is not
+    known, and void; and in how many of them the object or the background has no pixel, none of a
+    benchmark's."""
 
     samples: int
     object_px: int | None
@@ -32,8 +35,8 @@ class Counts(NamedTuple):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A named dataset: ``name``, ``version``, and the ``preset``, image ``size`` in px, ``light`` and ``rig`` that
-    build it."""
+    """A named dataset: ``name``, ``version``, and the ``preset``, image ``size`` in px, ``light``
+    and ``rig`` that build it."""
 
     name: str
     version: int
@@ -55,7 +58,11 @@ class Benchmark:
     @cached_property
     def _facts(self) -> dict[str, Any]:
         file = FACTS / f"{self.name}.json"
-        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {"content": {}, "counts": {}}
+        return (
+            json.loads(file.read_text(encoding="utf-8"))
+            if file.is_file()
+            else {"content": {}, "counts": {}}
+        )
 
     @property
     def content(self) -> dict[str, str]:
@@ -63,8 +70,8 @@ class Benchmark:
         return self._facts["content"]  # type: ignore[no-any-return]
 
     def counts(self, split: str, mode: str, target: str) -> dict[str, Counts]:
-        """By object of ``split``, or of all splits, how many pixels count by the rules of ``mode`` against ``target``;
-        empty for rules that the facts don't have."""
+        """By object of ``split``, or of all splits, how many pixels count by the rules of ``mode``
+        against ``target``; empty for rules that the facts don't have."""
         splits = [split] if split in self._facts["counts"] else list(self._facts["counts"])
         rules = [self._facts["counts"][name].get(f"{mode}/{target}", {}) for name in splits]
         return {name: Counts(*numbers) for objects in rules for name, numbers in objects.items()}
@@ -87,27 +94,32 @@ BENCHMARKS = (
     Benchmark("fpp-bench-test-crossed-workshop", 3, "test", FULL_SIZE, "workshop", "crossed"),
     Benchmark("fpp-bench-test-crossed-hard", 3, "test", FULL_SIZE, "hard", "crossed"),
 )
-"""The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset small` trains on."""
+"""The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset small`
+trains on."""
 
 
 def benchmark_of(content: Mapping[str, str]) -> Benchmark | None:
-    """The first of `BENCHMARKS` that has all of ``content`` (``split/column`` -> hash), None without: where the columns
-    are of the scenes alone, that with the paper's code."""
+    """The first of `BENCHMARKS` that has all of ``content`` (``split/column`` -> hash), None
+    without: where the columns are of the scenes alone, that with the paper's code."""
     return next((b for b in BENCHMARKS if content and content.items() <= b.content.items()), None)
 
 
 def known_problem(
     content: Mapping[str, str], split: str, target: str, mode: str, found: Mapping[str, Counts]
 ) -> str | None:
-    """What is not as in the named benchmark that has ``content``, of the objects ``found`` in a result: objects,
-    samples, or pixels of object and void; a sentence. None where all is, or the content is none of the benchmarks'."""
+    """What is not as in the named benchmark that has ``content``, of the objects ``found`` in a
+    result: objects, samples, or pixels of object and void; a sentence. None where all is, or the
+    content is none of the benchmarks'."""
     benchmark = benchmark_of(content)
     expected = {} if benchmark is None else benchmark.counts(split, mode, target)
     if benchmark is None or not expected:
         return None
     where = f"{benchmark.title}, {split} split,"
     if found.keys() != expected.keys():
-        foreign, missing = sorted(found.keys() - expected.keys()), sorted(expected.keys() - found.keys())
+        foreign, missing = (
+            sorted(found.keys() - expected.keys()),
+            sorted(expected.keys() - found.keys()),
+        )
         said = [f"has no object {name!r}, which this file has" for name in foreign[:1]]
         said += [f"has the object {name!r}, which this file lacks" for name in missing[:1]]
         return f"{where} {' and '.join(said)}"
@@ -120,9 +132,11 @@ def known_problem(
 
 
 def intended_benchmark(manifest: Manifest) -> Benchmark | None:
-    """The benchmark whose settings, but for the frames that are stored, a dataset was built with, whatever its content
-    is; None for settings of its own."""
-    from fpp_ml_bench.loaders.render.scene import preset_settings  # reading a dataset needs no renderer
+    """The benchmark whose settings, but for the frames that are stored, a dataset was built with,
+    whatever its content is; None for settings of its own."""
+    from fpp_ml_bench.loaders.render.scene import (
+        preset_settings,
+    )  # reading a dataset needs no renderer
 
     if manifest.origin != GENERATED:
         return None
@@ -138,18 +152,30 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
 
 
 def benchmark_sentence(manifest: Manifest) -> tuple[bool, str]:
-    """A sentence about what a dataset is by its manifest; False beside it for a benchmark's settings with other
-    content."""
+    """A sentence about what a dataset is by its manifest; False beside it for a benchmark's
+    settings with other content."""
     benchmark, intended = benchmark_of(manifest.content), intended_benchmark(manifest)
     if benchmark is not None:
         lacking = len(benchmark.content) > len(manifest.content)
-        return True, f"this is {benchmark.title}{', a part of its splits and columns' if lacking else ''}"
+        return (
+            True,
+            f"this is {benchmark.title}{', a part of its splits and columns' if lacking else ''}",
+        )
     if intended is None:
-        return True, "a dataset of its own, none of the named benchmarks: its scores compare only with scores on itself"
+        return (
+            True,
+            "a dataset of its own, none of the named benchmarks: its scores compare only with "
+            "scores on itself",
+        )
     expected = intended.content
-    other = next((key for key, digest in manifest.content.items() if expected.get(key) != digest), "its content")
+    other = next(
+        (key for key, digest in manifest.content.items() if expected.get(key) != digest),
+        "its content",
+    )
     return False, (
-        f"built with the settings of {intended.title}, but not its content ({other} differs): its scores do not "
-        "compare with that benchmark's. Build it again with this version of the package; if it still differs, please "
+        f"built with the settings of {intended.title}, but not its content ({other} differs): its "
+        f"scores do not "
+        "compare with that benchmark's. Build it again with this version of the package; if it "
+        "still differs, please "
         "report the processor and the package versions"
     )

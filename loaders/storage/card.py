@@ -1,6 +1,7 @@
-"""What describes a dataset: the files by which Hugging Face tools open its folder, the rig file, and its statistics.
-``datasets.load_dataset(FOLDER, "single_shot")`` follows the card's ``configs:`` and copies into its cache;
-``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place."""
+"""What describes a dataset: the files by which Hugging Face tools open its folder, the rig file,
+and its statistics. ``datasets.load_dataset(FOLDER, "single_shot")`` follows the card's ``configs:``
+and copies into its cache; ``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the
+split folders' ``state.json``, in place."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -91,16 +92,23 @@ def yaml_text(content: Any, allow_unicode: bool = False) -> str:
 
 
 def front_matter(
-    manifest: Manifest, configs: list[Any], licence: str | None = None, tags: Sequence[str] = (), **more: Any
+    manifest: Manifest,
+    configs: list[Any],
+    licence: str | None = None,
+    tags: Sequence[str] = (),
+    **more: Any,
 ) -> str:
-    """Front matter of a card: from it Hugging Face tools know configurations and files. ``licence`` is by default MIT,
-    for captures unknown, as they are under none until their owner says so; ``more`` are other keys."""
+    """Front matter of a card: from it Hugging Face tools know configurations and files. ``licence``
+    is by default MIT, for captures unknown, as they are under none until their owner says so;
+    ``more`` are other keys."""
     rows = sum(map(len, manifest.samples.values()))
     head = {
         "license": licence or ("unknown" if manifest.origin == CAPTURED else "mit"),
         "pretty_name": NAME,
         "task_categories": ["depth-estimation"],
-        "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
+        "size_categories": [
+            "n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"
+        ],
         "tags": ["fringe-projection-profilometry", "structured-light", "metrology", *tags],
         "configs": configs,
         **more,
@@ -108,9 +116,12 @@ def front_matter(
     return f"---\n{yaml_text(head)}---\n"
 
 
-def card_config(config: str, identity: str, files: Mapping[str, object], default: bool) -> dict[str, Any]:
-    """A configuration in the front matter; ``files`` are a pattern or names for each split, ``identity`` 64 hex digits
-    that change with the data, because ``datasets`` looks up its cached copies by version."""
+def card_config(
+    config: str, identity: str, files: Mapping[str, object], default: bool
+) -> dict[str, Any]:
+    """A configuration in the front matter; ``files`` are a pattern or names for each split,
+    ``identity`` 64 hex digits that change with the data, because ``datasets`` looks up its cached
+    copies by version."""
     return {
         "config_name": config,
         **({"default": True} if default else {}),
@@ -120,7 +131,8 @@ def card_config(config: str, identity: str, files: Mapping[str, object], default
 
 
 def card(manifest: Manifest, configs: list[Any], form: str, rows: int, text: str) -> bytes:
-    """The card of a folder with ``rows`` of the dataset in some ``form``; ``text`` says how to open it."""
+    """The card of a folder with ``rows`` of the dataset in some ``form``; ``text`` says how to open
+    it."""
     height, width = manifest.size
     title = f"# {NAME} dataset ({manifest.origin}){form}"
     counts = f"{rows} samples of {height} x {width} px; depth in mm, 0 = background."
@@ -129,14 +141,18 @@ def card(manifest: Manifest, configs: list[Any], form: str, rows: int, text: str
 
 
 def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> str:
-    """End of every card: the columns by their `features`, all frames in one line; limitations and citation."""
+    """End of every card: the columns by their `features`, all frames in one line; limitations and
+    citation."""
     frames, rows = [name for name in described if name.startswith("frame_")], []
     for name in (name for name in described if name not in frames[1:]):
         feature, many = described[name], name in frames and len(frames) > 1
         unit, meaning = MEANINGS["frame" if name in frames else name]
         dtype = "image, 8-bit grey" if feature["_type"] == "Image" else feature["dtype"]
         shape = f" {tuple(feature['shape'])}" if "shape" in feature else ""
-        rows.append(f"| `{name}`{f' ... `{frames[-1]}`' if many else ''} | {dtype}{shape} | {unit} | {meaning} |")
+        rows.append(
+            f"| `{name}`{f' ... `{frames[-1]}`' if many else ''} | {dtype}{shape} | {unit} | "
+            f"{meaning} |"
+        )
     settings, (near, far) = manifest.settings, rig_from_dict(manifest.rig).working_range_mm
     source = ""
     if "repository" in settings:
@@ -147,16 +163,23 @@ def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> 
         near=near,
         far=far,
         source=source,
-        rig="assumed to be that of the paper" if settings.get("rig_assumed") else "the one given at the import",
+        rig="assumed to be that of the paper"
+        if settings.get("rig_assumed")
+        else "the one given at the import",
     )
     return _END.format(columns="\n".join(rows), limits=limits)
 
 
 def write_card(folder: Path, manifest: Manifest) -> list[str]:
-    """Write card, rig and Hugging Face state files of a dataset with finished shards; returns their relative paths."""
+    """Write card, rig and Hugging Face state files of a dataset with finished shards; returns their
+    relative paths."""
     contents: dict[str, Any] = {"dataset_dict.json": {"splits": list(manifest.samples)}}
     for split in manifest.samples:
-        files = [shard.path for shard in manifest.shards if (shard.group, shard.split) == (DATA_GROUP, split)]
+        files = [
+            shard.path
+            for shard in manifest.shards
+            if (shard.group, shard.split) == (DATA_GROUP, split)
+        ]
         contents[f"{split}/state.json"] = {
             "_data_files": [{"filename": path.split("/")[-1]} for path in files],
             "_fingerprint": manifest.fingerprint[:16],
@@ -192,12 +215,15 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
 
 
 def split_statistics(manifest: Manifest) -> list[dict[str, Any]]:
-    """Statistics of each split that has rows in the manifest, and last of all rows together, as a split called ``all``:
-    lengths in mm, shares from 0 to 1, None where a dataset has no exact depth. ``gt_mae_mm`` and ``gt_rmse_mm`` are the
-    uncertainty of the ground truth: decoded against exact depth over all object pixels, averaged over samples like
-    every score; ``gt_interior_*`` over those 3 px or more from depth edges."""
+    """Statistics of each split that has rows in the manifest, and last of all rows together, as a
+    split called ``all``: lengths in mm, shares from 0 to 1, None where a dataset has no exact
+    depth. ``gt_mae_mm`` and ``gt_rmse_mm`` are the uncertainty of the ground truth: decoded against
+    exact depth over all object pixels, averaged over samples like every score; ``gt_interior_*``
+    over those 3 px or more from depth edges."""
     whole = [row for rows in manifest.samples.values() for row in rows]
-    return [_split(split, rows, manifest) for split, rows in (*manifest.samples.items(), ("all", whole))]
+    return [
+        _split(split, rows, manifest) for split, rows in (*manifest.samples.items(), ("all", whole))
+    ]
 
 
 def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[str, Any]:
@@ -223,17 +249,23 @@ def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[s
         "depth_range_max_mm": float(ranges.max()),
         **{name: average(name) for name in means},
         "gt_max_mm": max(largest) if largest else None,
-        "undecoded_share": sum(row.get("undecoded_px") or 0 for row in rows) / exact_px if exact_px else None,
+        "undecoded_share": sum(row.get("undecoded_px") or 0 for row in rows) / exact_px
+        if exact_px
+        else None,
         "void_share": sum(row.get("void_px") or 0 for row in rows) / exact_px if exact_px else None,
     }
 
 
 def ground_truth_summary(manifest: Manifest) -> list[str]:
-    """A sentence per split on the error of the decoded ground truth against the exact depth; none for imported data."""
+    """A sentence per split on the error of the decoded ground truth against the exact depth; none
+    for imported data."""
     return [
-        f"{s['split']}: ground truth within {s['gt_mae_mm']:.3f} mm MAE, {s['gt_rmse_mm']:.3f} mm RMSE of the exact "
-        f"depth ({s['gt_interior_mae_mm']:.3f} mm 3 px or more from depth edges); {100 * s['undecoded_share']:.2f}% of "
-        f"object pixels not decodable, {100 * s['void_share']:.2f}% void (unlit, or surfaces mixed in a pixel)"
+        f"{s['split']}: ground truth within {s['gt_mae_mm']:.3f} mm MAE, {s['gt_rmse_mm']:.3f} mm "
+        f"RMSE of the exact "
+        f"depth ({s['gt_interior_mae_mm']:.3f} mm 3 px or more from depth edges); "
+        f"{100 * s['undecoded_share']:.2f}% of "
+        f"object pixels not decodable, {100 * s['void_share']:.2f}% void (unlit, or surfaces mixed "
+        f"in a pixel)"
         for s in split_statistics(manifest)[:-1]
         if None not in (s["gt_mae_mm"], s["gt_interior_mae_mm"], s["undecoded_share"])
     ]

@@ -1,8 +1,9 @@
 """Reading a dataset folder: single images, or all as a ``datasets.Dataset`` on memory maps.
 
-The evaluator, the classical method, the torch dataset and the pictures read through `DatasetFolder`, which needs only
-NumPy and pyarrow. Plain ``datasets.load_dataset`` copies what it reads into its cache, and its Arrow builder can't
-leave columns out; `load_dataset` joins the tables of the column groups, and a frame is read only when its row is.
+The evaluator, the classical method, the torch dataset and the pictures read through
+`DatasetFolder`, which needs only NumPy and pyarrow. Plain ``datasets.load_dataset`` copies what it
+reads into its cache, and its Arrow builder can't leave columns out; `load_dataset` joins the tables
+of the column groups, and a frame is read only when its row is.
 """
 
 import io
@@ -49,28 +50,34 @@ if TYPE_CHECKING:
     from datasets import Dataset, DatasetDict
 
 ALL_SPLITS = "all"
-_METADATA_BYTES = 1 << 20  # what pyarrow reads at once is a body if it is larger: the metadata of a shard are 10 kB
+_METADATA_BYTES = 1 << 20
+"""What pyarrow reads at once is a body if it is larger: the metadata of a shard are 10 kB."""
 
 
 class DatasetFolder:
-    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder. Images are read-only,
-    and only those that are used are read. Instances pickle by path, so worker processes open the files themselves."""
+    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder.
+    Images are read-only, and only those that are used are read. Instances pickle by path, so worker
+    processes open the files themselves."""
 
     def __init__(self, path: str | Path, check: bool = True, truth: bool = True) -> None:
-        """With ``check`` off, the folder opens even if some of its files are missing or cut. With ``truth`` off it is
-        what methods are given: of samples outside the training split no depth, flags, range and measurements."""
+        """With ``check`` off, the folder opens even if some of its files are missing or cut. With
+        ``truth`` off it is what methods are given: of samples outside the training split no depth,
+        flags, range and measurements."""
         self.path, self.truth = Path(path), truth
         manifest = read_manifest(self.path)
         self.fingerprint = manifest.fingerprint
         """SHA-256 of the data's content, 64 hex digits."""
         shown = {
-            split: rows if truth or split == TRAIN else [{key: row[key] for key in NAMES} for row in rows]
+            split: rows
+            if truth or split == TRAIN
+            else [{key: row[key] for key in NAMES} for row in rows]
             for split, rows in manifest.samples.items()
         }
         self.manifest = replace(manifest, samples=shown)
         self._opened: dict[str, OpenShard] = {}
         self._latest: tuple[str, dict[str, NDArray]] = "", {}
-        """The sample that was read last, and its images by column: they are often asked for again."""
+        """The sample that was read last, and its images by column: they are often asked for
+        again."""
         for shard in self.manifest.shards if check else ():
             if damage := damage_of(self.path, shard, whole=False):
                 raise DatasetError(damage)
@@ -88,27 +95,35 @@ class DatasetFolder:
 
     @property
     def content(self) -> dict[str, str]:
-        """``split/column`` -> hash of its decoded values, by the manifest; `fpp-bench verify` reads the images."""
+        """``split/column`` -> hash of its decoded values, by the manifest; `fpp-bench verify` reads
+        the images."""
         return self.manifest.content
 
     def check_content(self, content: Mapping[str, str], made: str) -> None:
-        """Raise `DatasetError` for a ``split/column`` of ``content`` whose hash is another here; columns that are not
-        stored here don't tell. ``made``: the folder of predictions of data with that content."""
-        changed = next((name for name, digest in content.items() if self.content.get(name, digest) != digest), None)
+        """Raise `DatasetError` for a ``split/column`` of ``content`` whose hash is another here;
+        columns that are not stored here don't tell. ``made``: the folder of predictions of data
+        with that content."""
+        changed = next(
+            (name for name, digest in content.items() if self.content.get(name, digest) != digest),
+            None,
+        )
         if changed is not None:
             made = printable(made, 500)
             raise DatasetError(
-                f"{self.path}: is not what {made} was predicted from, {printable(changed)} is another now; give the "
+                f"{self.path}: is not what {made} was predicted from, {printable(changed)} is "
+                f"another now; give the "
                 f"dataset: fpp-eval {made} DATASET, or predict again"
             )
 
     def content_hash(self, split: str, column: str, hashes: Mapping[str, str]) -> tuple[str, str]:
-        """``split/column``, and the hash of its images, of which ``hashes`` are those of the samples (`image_hash`).
-        Raises `DatasetError` where the manifest has another: the files were changed after it was written."""
+        """``split/column``, and the hash of its images, of which ``hashes`` are those of the
+        samples (`image_hash`). Raises `DatasetError` where the manifest has another: the files were
+        changed after it was written."""
         name, found = f"{split}/{column}", layout.column_hash(hashes)
         if found != self.content.get(name):
             raise DatasetError(
-                f"{self.path}: {column} of split {split} is not what {MANIFEST} says, so it was changed or damaged; "
+                f"{self.path}: {column} of split {split} is not what {MANIFEST} says, so it was "
+                f"changed or damaged; "
                 "run: fpp-bench verify, and build or copy the dataset again"
             )
         return name, found
@@ -134,7 +149,8 @@ class DatasetFolder:
 
     @property
     def has_exact(self) -> bool:
-        """Whether the dataset has ``depth_exact`` (generated data; published data has decoded depth only)."""
+        """Whether the dataset has ``depth_exact`` (generated data; published data has decoded depth
+        only)."""
         return self.manifest.exact
 
     @cached_property
@@ -144,14 +160,22 @@ class DatasetFolder:
 
     @cached_property
     def _position(self) -> dict[str, tuple[str, int]]:
-        return {sample: (split, row) for split, names in self.splits.items() for row, sample in enumerate(names)}
+        return {
+            sample: (split, row)
+            for split, names in self.splits.items()
+            for row, sample in enumerate(names)
+        }
 
     def samples(self, split: str) -> list[str]:
-        """Sample names of ``split``, or of every split in turn for ``all``. Raises `DatasetError` for other names."""
+        """Sample names of ``split``, or of every split in turn for ``all``. Raises `DatasetError`
+        for other names."""
         if split == ALL_SPLITS:
             return [name for part in SPLITS for name in self.splits.get(part, [])]
         if split not in self.splits:
-            raise DatasetError(f"{self.path}: no split {split!r}; there are {', '.join(self.splits)} and {ALL_SPLITS}")
+            raise DatasetError(
+                f"{self.path}: no split {split!r}; there are {', '.join(self.splits)} and "
+                f"{ALL_SPLITS}"
+            )
         return list(self.splits[split])
 
     def split_of_sample(self, sample: str) -> str:
@@ -159,7 +183,8 @@ class DatasetFolder:
         return self._find(sample)[0]
 
     def measured(self, sample: str) -> dict:
-        """The builder's measurements of a sample: labels, cover, distance, and the ground-truth error if available."""
+        """The builder's measurements of a sample: labels, cover, distance, and the ground-truth
+        error if available."""
         split, row = self._find(sample)
         return self.manifest.samples[split][row]
 
@@ -172,57 +197,74 @@ class DatasetFolder:
 
     def _find(self, sample: str) -> tuple[str, int]:
         if sample not in self._position:
-            raise DatasetError(f"{self.path}: no sample {sample!r}; {did_you_mean(sample, self._position)}")
+            raise DatasetError(
+                f"{self.path}: no sample {sample!r}; {did_you_mean(sample, self._position)}"
+            )
         return self._position[sample]
 
     def depth_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """Depth map of a sample, float32 (H, W) in mm, 0 = background: ``depth``, or ``depth_exact`` if stored."""
+        """Depth map of a sample, float32 (H, W) in mm, 0 = background: ``depth``, or
+        ``depth_exact`` if stored."""
         if column not in DEPTHS:
-            raise DatasetError(f"unknown depth column {column!r}; there are {DEPTH} and {DEPTH_EXACT}")
+            raise DatasetError(
+                f"unknown depth column {column!r}; there are {DEPTH} and {DEPTH_EXACT}"
+            )
         if column == DEPTH_EXACT and not self.has_exact:
-            raise DatasetError(f"{self.path}: has no {DEPTH_EXACT} ({self.manifest.origin} data); use {DEPTH}")
+            raise DatasetError(
+                f"{self.path}: has no {DEPTH_EXACT} ({self.manifest.origin} data); use {DEPTH}"
+            )
         return self._image(sample, DATA_GROUP, column)
 
     def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background. Which of its pixels
-        count is `void`'s business."""
+        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background.
+        Which of its pixels count is `void`'s business."""
         return self.depth_mm(sample, column)
 
     def flags(self, sample: str) -> NDArray[np.uint8]:
-        """What is special about each pixel: bits of `loaders.sample.Flag`, uint8 (H, W); of generated data."""
+        """What is special about each pixel: bits of `loaders.sample.Flag`, uint8 (H, W); of
+        generated data."""
         if not self.has_exact:
             raise DatasetError(f"{self.path}: has no {FLAGS} ({self.manifest.origin} data)")
         return self._image(sample, DATA_GROUP, FLAGS)
 
     def void(self, sample: str, column: str = DEPTH) -> NDArray[np.bool_]:
-        """Pixels that count in no score against ``column``, bool (H, W): of ``depth_exact`` `exact_void`, of ``depth``
-        `void_pixels`, with surface that has no decoded depth. None are in data without flags."""
+        """Pixels that count in no score against ``column``, bool (H, W): of ``depth_exact``
+        `exact_void`, of ``depth`` `void_pixels`, with surface that has no decoded depth. None are
+        in data without flags."""
         if not self.has_exact:
             return np.zeros(self.size, dtype=bool)
         if column == DEPTH_EXACT:
             return exact_void(self.flags(sample))
-        return void_pixels(self.flags(sample), self.depth_mm(sample), self.depth_mm(sample, DEPTH_EXACT))
+        return void_pixels(
+            self.flags(sample), self.depth_mm(sample), self.depth_mm(sample, DEPTH_EXACT)
+        )
 
-    def left_out(self, sample: str, rule: RangeRule, column: str = DEPTH) -> NDArray[np.bool_] | None:
-        """Pixels that the depth range by ``rule`` leaves out of ``column``, bool (H, W), None for none: the void ones;
-        and of the exact depth what has no decoded one, because methods are given the range of ``depth``."""
+    def left_out(
+        self, sample: str, rule: RangeRule, column: str = DEPTH
+    ) -> NDArray[np.bool_] | None:
+        """Pixels that the depth range by ``rule`` leaves out of ``column``, bool (H, W), None for
+        none: the void ones; and of the exact depth what has no decoded one, because methods are
+        given the range of ``depth``."""
         if rule == "valid":
             return self.void(sample)
         return ~object_mask(self.depth_mm(sample)) if column == DEPTH_EXACT else None
 
     def unlit_mm(self, sample: str) -> NDArray[np.float32]:
-        """Exact depth of the surface that the camera sees and the projector does not light, or too weakly (`Flag`),
-        float32 (H, W) in mm, 0 everywhere else. Raises `DatasetError` for data without flags."""
+        """Exact depth of the surface that the camera sees and the projector does not light, or too
+        weakly (`Flag`), float32 (H, W) in mm, 0 everywhere else. Raises `DatasetError` for data
+        without flags."""
         unlit = (self.flags(sample) & np.uint8(Flag.UNLIT | Flag.WEAK)) != 0
         return np.where(unlit, self.depth_mm(sample, DEPTH_EXACT), np.float32(0))
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
-        """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""
+        """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store
+        it."""
         for group, frames in self.manifest.groups.items():
             if index in frames:
                 return self._image(sample, group, self.sequence.frames[index].column)
         raise DatasetError(
-            f"{self.path}: frame {index} is not stored here (configurations: {', '.join(self.configs)}); build with "
+            f"{self.path}: frame {index} is not stored here (configurations: "
+            f"{', '.join(self.configs)}); build with "
             "--config all"
         )
 
@@ -243,21 +285,31 @@ class DatasetFolder:
             split, row = self._find(sample)
             if column in self._hidden(split):
                 raise DatasetError(
-                    f"{self.path}: {column} of {sample} is truth of the {split} split, and methods are given that of "
+                    f"{self.path}: {column} of {sample} is truth of the {split} split, and methods "
+                    f"are given that of "
                     f"the {TRAIN} split alone; open the dataset outside the method to look at it"
                 )
             for shard in self.manifest.shards:
-                if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
+                if (
+                    shard.split == split
+                    and shard.group == group
+                    and 0 <= row - shard.first_row < shard.rows
+                ):
                     images[column] = self.opened(shard).image(column, row - shard.first_row)
                     break
             else:
-                raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
+                raise DatasetError(
+                    f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench "
+                    f"verify"
+                )
         return images[column]
 
     def opened(self, shard: ShardFile) -> "OpenShard":
         """A file of the dataset, opened for reading."""
         if shard.path not in self._opened:
-            self._opened[shard.path] = OpenShard(self.path / shard.path, self.size, self._hidden(shard.split))
+            self._opened[shard.path] = OpenShard(
+                self.path / shard.path, self.size, self._hidden(shard.split)
+            )
         return self._opened[shard.path]
 
     def _hidden(self, split: str) -> tuple[str, ...]:
@@ -266,18 +318,21 @@ class DatasetFolder:
 
 
 class OpenShard:
-    """An Arrow file, of whose columns parts are read, but ``hidden`` ones: ``types`` are `stored_types`, and ``rows``
-    are those of the file. Raises `DatasetError` naming the file where it can't be read.
+    """An Arrow file, of whose columns parts are read, but ``hidden`` ones: ``types`` are
+    `stored_types`, and ``rows`` are those of the file. Raises `DatasetError` naming the file where
+    it can't be read.
 
-    It is read and not mapped: a mapped file that is cut meanwhile would end the process (SIGBUS). And every length and
-    offset in it is compared with the file and the images' ``size`` (H, W) before anything follows it."""
+    It is read and not mapped: a mapped file that is cut meanwhile would end the process (SIGBUS).
+    And every length and offset in it is compared with the file and the images' ``size`` (H, W)
+    before anything follows it."""
 
     def __init__(self, path: Path, size: tuple[int, int], hidden: Collection[str] = ()) -> None:
         import pyarrow as pa
 
         self.path, self._size = path, size
         self._parts: dict[str, list[tuple[int, list[tuple[int, int]]]]] = {}
-        """Of each column and record batch its rows, and its buffers' places in the file, each a start and bytes."""
+        """Of each column and record batch its rows, and its buffers' places in the file, each a
+        start and bytes."""
         self._starts: dict[str, list[tuple[int, int]]] = {}
         try:
             with opened(path, links=True) as (stream, _):
@@ -293,7 +348,9 @@ class OpenShard:
                     buffers = [skeleton.place(buffer) for buffer in column.buffers()]
                     self._parts.setdefault(name, []).append((batch.num_rows, buffers))
         except (pa.ArrowException, PredictionError, OSError, ValueError) as error:
-            raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
+            raise DatasetError(
+                f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify"
+            ) from error
         self.rows = sum(batch.num_rows for batch in batches)
         types = stored_types(batches[0].schema) if batches else []
         self.types = [(name, kind) for name, kind in types if name not in hidden]
@@ -304,7 +361,9 @@ class OpenShard:
         dtype = self._dtype(column)
         for rows, start in self._images(column):
             if row < rows:
-                pixels = self._read(start + row * height * width * dtype.itemsize, height * width, dtype)
+                pixels = self._read(
+                    start + row * height * width * dtype.itemsize, height * width, dtype
+                )
                 return pixels.reshape(self._size)
             row -= rows
         raise DatasetError(f"{self.path}: fewer rows than its manifest says; run: fpp-bench verify")
@@ -313,16 +372,22 @@ class OpenShard:
         """So many rows from ``first`` on of a column, as they are stored."""
         import pyarrow as pa
 
-        from fpp_ml_bench.loaders.storage.shards import image_column  # imports pyarrow, which takes 0.2 s
+        from fpp_ml_bench.loaders.storage.shards import (
+            image_column,
+        )  # imports pyarrow, which takes 0.2 s
 
         kind = dict(self.types)[name]
         if pa.types.is_list(kind):
-            return image_column(np.stack([self.image(name, row) for row in range(first, first + rows)]), kind)
+            return image_column(
+                np.stack([self.image(name, row) for row in range(first, first + rows)]), kind
+            )
         parts = []
         for count, places in self._parts[name]:
             buffers = [pa.py_buffer(self._read(*place, np.dtype(np.uint8))) for place in places]
             try:
-                array = pa.Array.from_buffers(kind, count, [buffer if buffer.size else None for buffer in buffers])
+                array = pa.Array.from_buffers(
+                    kind, count, [buffer if buffer.size else None for buffer in buffers]
+                )
                 array.validate(full=True)
             except (pa.ArrowException, ValueError) as error:
                 raise self._fault(name, f"leads behind its end or is damaged ({error})") from error
@@ -349,10 +414,15 @@ class OpenShard:
             (height, width), dtype, index = self._size, self._dtype(column), np.dtype(np.int32)
             starts = []
             for rows, (_, outer, _, inner, _, (start, size)) in self._parts[column]:
-                lists, pixels = ((outer, rows, height), (inner, rows * height, width)), rows * height * width
+                lists, pixels = (
+                    ((outer, rows, height), (inner, rows * height, width)),
+                    rows * height * width,
+                )
                 fits = size >= pixels * dtype.itemsize and all(
                     size >= (count + 1) * index.itemsize
-                    and np.array_equal(self._read(at, count + 1, index), np.arange(count + 1) * length)
+                    and np.array_equal(
+                        self._read(at, count + 1, index), np.arange(count + 1) * length
+                    )
                     for (at, size), count, length in lists
                 )
                 if not fits:
@@ -381,13 +451,15 @@ class OpenShard:
 
 
 def stored_types(schema: "pa.Schema") -> "list[tuple[str, pa.DataType]]":
-    """Columns and what they are stored as, whether or not `datasets` has registered its array extension."""
+    """Columns and what they are stored as, whether or not `datasets` has registered its array
+    extension."""
     return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
 
 
 class _Skeleton(io.RawIOBase):
-    """A file for pyarrow, which reads its metadata. In the place of a large body it gets memory that holds nothing and
-    takes none: from where the buffers of its columns begin in it, `place` tells where they are in the file."""
+    """A file for pyarrow, which reads its metadata. In the place of a large body it gets memory
+    that holds nothing and takes none: from where the buffers of its columns begin in it, `place`
+    tells where they are in the file."""
 
     def __init__(self, file: int) -> None:
         self._file, self._size, self._position = file, os.fstat(file).st_size, 0
@@ -401,13 +473,16 @@ class _Skeleton(io.RawIOBase):
         if count <= _METADATA_BYTES:
             content: Any = os.pread(self._file, count, self._position)
         else:
-            content = mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ)
+            content = mmap.mmap(
+                -1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ
+            )
         self._given.append((np.frombuffer(content, np.uint8), self._position))
         self._position += len(content)
         return content
 
     def place(self, buffer: "pa.Buffer | None") -> tuple[int, int]:
-        """Where in the file a buffer begins, and its bytes, 0 for none. ValueError for one that the file lacks."""
+        """Where in the file a buffer begins, and its bytes, 0 for none. ValueError for one that the
+        file lacks."""
         if buffer is None or not buffer.size:
             return 0, 0
         for content, position in self._given:
@@ -417,7 +492,9 @@ class _Skeleton(io.RawIOBase):
         raise ValueError("a buffer that is compressed, or leads elsewhere")
 
 
-def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
+def load_dataset(
+    folder: str | Path, config: str = "single_shot", split: str | None = None
+) -> "Dataset | DatasetDict":
     """Open a dataset folder as a ``datasets.Dataset`` on the memory-mapped shards.
 
     Parameters
@@ -455,13 +532,16 @@ def load_dataset(folder: str | Path, config: str = "single_shot", split: str | N
         raise DatasetError(f"unknown configuration {config!r}; there are {', '.join(CONFIGS)}")
     if config not in dataset.configs:
         raise DatasetError(
-            f"{folder}: configuration {config!r} is not stored; this dataset has {', '.join(dataset.configs)}. Build "
+            f"{folder}: configuration {config!r} is not stored; this dataset has "
+            f"{', '.join(dataset.configs)}. Build "
             f"it with --config {config} or --config all"
         )
     if split is not None:
         dataset.samples(split)
         if split not in dataset.splits:
-            raise DatasetError(f"split {split!r}: expected one of {', '.join(dataset.splits)}, or None for all")
+            raise DatasetError(
+                f"split {split!r}: expected one of {', '.join(dataset.splits)}, or None for all"
+            )
         return _joined_split(dataset, config, split)
     from datasets import DatasetDict
 
@@ -486,6 +566,9 @@ def _joined_split(dataset: DatasetFolder, config: str, split: str) -> "Dataset":
     table = tables[0] if len(tables) == 1 else ConcatenationTable.from_tables(tables, axis=1)
     described = Features.from_dict(layout.features(columns, dataset.size))
     info = DatasetInfo(features=described, config_name=config, dataset_name="fpp-ml-bench")
-    # `datasets` caches later transforms by this fingerprint: it depends on the data, not on the path.
+    # `datasets` caches later transforms by this fingerprint: it depends on the data, not on the
+    # path.
     fingerprint = f"{dataset.fingerprint[:16]}-{config}-{split}"
-    return Dataset(table.select(columns), info=info, split=NamedSplit(split), fingerprint=fingerprint)
+    return Dataset(
+        table.select(columns), info=info, split=NamedSplit(split), fingerprint=fingerprint
+    )

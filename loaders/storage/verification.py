@@ -1,4 +1,5 @@
-"""Proving a dataset intact and its splits clean. Every finding is a sentence that names the file or sample."""
+"""Proving a dataset intact and its splits clean. Every finding is a sentence that names the file or
+sample."""
 
 from collections.abc import Callable
 from itertools import accumulate
@@ -40,10 +41,11 @@ Hashes = dict[tuple[str, str], dict[str, str]]
 def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -> list[str]:
     """Findings of a complete check of a dataset folder; an empty list means intact.
 
-    Checks: every file of the manifest is there with its checksum; no foreign file; every Arrow file holds the rows and
-    columns it should; labels and depth ranges agree with the images; depths are finite and not negative; no object is
-    in two splits, none lacks a view, the benchmark's own objects are in their split; no image appears in two splits.
-    Raises ``DatasetError`` when there is no readable manifest. ``progress`` is called with 1 for each file."""
+    Checks: every file of the manifest is there with its checksum; no foreign file; every Arrow file
+    holds the rows and columns it should; labels and depth ranges agree with the images; depths are
+    finite and not negative; no object is in two splits, none lacks a view, the benchmark's own
+    objects are in their split; no image appears in two splits. Raises ``DatasetError`` when there
+    is no readable manifest. ``progress`` is called with 1 for each file."""
     opened = DatasetFolder(folder, check=False)
     manifest = opened.manifest
     findings = _foreign_files(folder, manifest)
@@ -52,18 +54,24 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
         if damage := damage_of(folder, file):
             findings.append(damage)
         elif isinstance(file, ShardFile):
-            # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
+            # Straight after its checksum the file is still in the page cache, so looking inside
+            # costs no second read.
             try:
                 findings += _shard_findings(opened, file, hashes, uniform)
             except DatasetError as error:  # no Arrow file, or images of another size
                 findings.append(str(error))
         progress(1)
-    findings += _coverage_findings(manifest) + _split_findings(manifest) + _duplicate_images(hashes, uniform)
+    findings += (
+        _coverage_findings(manifest)
+        + _split_findings(manifest)
+        + _duplicate_images(hashes, uniform)
+    )
     return findings or _content_findings(opened, hashes)
 
 
 def _foreign_files(folder: Path, manifest: Manifest) -> list[str]:
-    """Files that the manifest does not know; the caches that ``datasets`` itself leaves there are not counted."""
+    """Files that the manifest does not know; the caches that ``datasets`` itself leaves there are
+    not counted."""
     listed = {MANIFEST, *(file.path for file in manifest.files)}
     findings = []
     for path in sorted(folder.rglob("*")):
@@ -75,9 +83,12 @@ def _foreign_files(folder: Path, manifest: Manifest) -> list[str]:
     return findings
 
 
-def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uniform: set[str]) -> list[str]:
-    """Look inside one intact file: rows, columns, labels, values. Notes every image's hash, and in ``uniform`` those of
-    images of a single value, which (black without noise) say nothing about what they show."""
+def _shard_findings(
+    opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uniform: set[str]
+) -> list[str]:
+    """Look inside one intact file: rows, columns, labels, values. Notes every image's hash, and in
+    ``uniform`` those of images of a single value, which (black without noise) say nothing about
+    what they show."""
     path = opened.path / shard.path
     manifest = opened.manifest
     rows = manifest.samples.get(shard.split, [])[shard.first_row : shard.first_row + shard.rows]
@@ -85,7 +96,10 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uni
         return [f"{path}: the manifest has no such rows"]
     expected = manifest.columns(shard.group)
     file = opened.opened(shard)
-    if file.types != stored_types(arrow_schema(manifest.features(shard.group))) or file.rows != shard.rows:
+    if (
+        file.types != stored_types(arrow_schema(manifest.features(shard.group)))
+        or file.rows != shard.rows
+    ):
         return [f"{path}: its rows or columns are not those the manifest says"]
     findings = []
     if shard.group == DATA_GROUP:
@@ -93,14 +107,22 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uni
         stored = pa.table(named).to_pylist()
         wanted = [labels_of(row, shard.split) for row in rows]
         pairs = zip(wanted, stored, strict=True)
-        findings += [f"{path}: expected labels {row}, found {labels}" for row, labels in pairs if labels != row]
+        findings += [
+            f"{path}: expected labels {row}, found {labels}"
+            for row, labels in pairs
+            if labels != row
+        ]
     for column in expected:
         if column in (*LABELS, *RANGE):
             continue
         for number, row in enumerate(rows):
             image = file.image(column, number)
             problem = depth_problem(image) if column in DEPTHS else None
-            if column == DEPTH and not problem and depth_range_mm(image) != (row["depth_min_mm"], row["depth_max_mm"]):
+            if (
+                column == DEPTH
+                and not problem
+                and depth_range_mm(image) != (row["depth_min_mm"], row["depth_max_mm"])
+            ):
                 problem = "depth_min and depth_max do not fit its depth"
             if column == FLAGS and image.max() > sum(Flag):
                 problem = "unknown flags"
@@ -114,14 +136,20 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uni
 
 
 def _coverage_findings(manifest: Manifest) -> list[str]:
-    """Rows that no file holds, or more than one: every group's files must follow on from each other."""
+    """Rows that no file holds, or more than one: every group's files must follow on from each
+    other."""
     findings = []
     for split, rows in manifest.samples.items():
         for group in manifest.groups:
-            files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
+            files = [
+                shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)
+            ]
             ends = list(accumulate((shard.rows for shard in files), initial=0))
             if ends[-1] != len(rows) or ends[:-1] != [shard.first_row for shard in files]:
-                findings.append(f"{split}, {group}: the files hold {ends[-1]} rows, expected each of {len(rows)} once")
+                findings.append(
+                    f"{split}, {group}: the files hold {ends[-1]} rows, expected each of "
+                    f"{len(rows)} once"
+                )
     return findings
 
 
@@ -135,21 +163,34 @@ def _split_findings(manifest: Manifest) -> list[str]:
             name, view = row["object"], row["view"]
             views.setdefault(name, []).append(view)
             if row["sample"] != sample_name(name, view):
-                findings.append(f"sample {row['sample']!r} in {split}: said to be view {view} of {name!r}")
+                findings.append(
+                    f"sample {row['sample']!r} in {split}: said to be view {view} of {name!r}"
+                )
         for name, seen in views.items():
             if home.setdefault(name, split) != split:
-                findings.append(f"object {name!r} is in two splits, {home[name]} and {split}: scores would leak")
+                findings.append(
+                    f"object {name!r} is in two splits, {home[name]} and {split}: scores would leak"
+                )
             expected_views = set(seen) if manifest.origin == CAPTURED else VIEWS
             if sorted(seen) != sorted(expected_views):
                 expected, found = ", ".join(expected_views), ", ".join(seen)
-                findings.append(f"object {name!r} in {split}: expected the views {expected}, found {found}")
-            if manifest.origin == GENERATED and name in (*OBJECTS, *UNSEEN) and split_of(name) != split:
-                findings.append(f"object {name!r} is in {split}, the benchmark has it in {split_of(name)}")
+                findings.append(
+                    f"object {name!r} in {split}: expected the views {expected}, found {found}"
+                )
+            if (
+                manifest.origin == GENERATED
+                and name in (*OBJECTS, *UNSEEN)
+                and split_of(name) != split
+            ):
+                findings.append(
+                    f"object {name!r} is in {split}, the benchmark has it in {split_of(name)}"
+                )
     return findings
 
 
 def _content_findings(opened: DatasetFolder, hashes: Hashes) -> list[str]:
-    """Columns whose images are not those that the manifest was written for, and so maybe no benchmark's."""
+    """Columns whose images are not those that the manifest was written for, and so maybe no
+    benchmark's."""
     findings = []
     for (split, column), images in hashes.items():
         try:
@@ -157,7 +198,11 @@ def _content_findings(opened: DatasetFolder, hashes: Hashes) -> list[str]:
         except DatasetError as error:
             findings.append(str(error))
     named = {f"{split}/{column}" for split, column in hashes}
-    return findings + [f"{opened.path}: {name} is in {MANIFEST} only" for name in opened.content if name not in named]
+    return findings + [
+        f"{opened.path}: {name} is in {MANIFEST} only"
+        for name in opened.content
+        if name not in named
+    ]
 
 
 def _duplicate_images(hashes: Hashes, uniform: set[str]) -> list[str]:

@@ -1,4 +1,5 @@
-"""The classical method: its error obeys the noise law over N, and it reads only the frames that it names."""
+"""The classical method: its error obeys the noise law over N, and it reads only the frames that it
+names."""
 
 from dataclasses import replace
 
@@ -29,8 +30,9 @@ STEPS = (3, 4, 6, 9, 18)
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory):
-    """A cork at 240 px and noise of 3 grey levels, where sensor noise and not the 8-bit pattern decides. In direct
-    light on one ray a pixel: further bounces and mixed pixels move the phase by what no step averages away."""
+    """A cork at 240 px and noise of 3 grey levels, where sensor noise and not the 8-bit pattern
+    decides. In direct light on one ray a pixel: further bounces and mixed pixels move the phase by
+    what no step averages away."""
     folder = tmp_path_factory.mktemp("noisy") / "set"
     noisy = DIRECT.changed("camera", **camera_noise(3.0))
     build(folder, BuildSettings(paper_rig(240), ("bowl", "cork"), light=noisy), workers=1)
@@ -38,7 +40,8 @@ def noisy(tmp_path_factory):
 
 
 def interior_rmse_mm(opened, direction, steps):
-    """RMSE against exact depth over all object pixels 3 px or more from an edge that are decoded."""
+    """RMSE against exact depth over all object pixels 3 px or more from an edge that are
+    decoded."""
     classical = ClassicalMethod(opened.rig, direction=direction, steps=steps)
     squares, count = 0.0, 0
     for sample in opened.samples("all"):
@@ -46,7 +49,8 @@ def interior_rmse_mm(opened, direction, steps):
         depth = classical.predict(opened.frames(sample, range(len(opened.sequence))))
         inside = object_mask(exact) & (edge_distance_px(exact) >= 3) & object_mask(depth)
         error = depth[inside].astype(np.float64) - exact[inside]
-        # A handful of grazing pixels of almost no modulation would decide alone: leave out the dimmest tenth.
+        # A handful of grazing pixels of almost no modulation would decide alone: leave out the
+        # dimmest tenth.
         white = opened.frame(sample, opened.sequence.white)[inside]
         bright = white > np.quantile(white, 0.1)
         squares += float((error[bright] ** 2).sum())
@@ -71,8 +75,8 @@ def test_both_directions_are_better_than_either(noisy):
 
 @pytest.mark.parametrize(("direction", "steps"), [("both", 18), ("vertical", 6), ("horizontal", 4)])
 def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps):
-    """Where noise is all there is, before what light and calibration may add; of grazing pixels of almost no modulation
-    only the luckier ones are decoded."""
+    """Where noise is all there is, before what light and calibration may add; of grazing pixels of
+    almost no modulation only the luckier ones are decoded."""
     classical = ClassicalMethod(noisy.rig, direction=direction, steps=steps)
     deviations = []
     for sample in noisy.samples("all"):
@@ -80,8 +84,15 @@ def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps):
         answer, _ = classical.measure(noisy.frames(sample, range(len(noisy.sequence))))
         np.testing.assert_array_equal(answer.sigma_mm > 0, answer.depth > 0)
         white = noisy.frame(sample, noisy.sequence.white)
-        inside = object_mask(exact) & (edge_distance_px(exact) >= 3) & object_mask(answer.depth) & (white > 60)
-        deviations.append(np.abs(answer.depth.astype(np.float64) - exact)[inside] / answer.sigma_mm[inside])
+        inside = (
+            object_mask(exact)
+            & (edge_distance_px(exact) >= 3)
+            & object_mask(answer.depth)
+            & (white > 60)
+        )
+        deviations.append(
+            np.abs(answer.depth.astype(np.float64) - exact)[inside] / answer.sigma_mm[inside]
+        )
     found = np.concatenate(deviations)
     for sigmas, nominal in ((0.9945, 0.68), (1.96, 0.95), (2.576, 0.99)):
         assert (found < sigmas).mean() == pytest.approx(nominal, abs=0.02)
@@ -91,14 +102,22 @@ def test_the_calibration_s_error_is_stated_and_moves_no_depth(noisy):
     known = replace(noisy.rig, calibration_px=0.25)
     assert known == noisy.rig and rig_from_dict(known.to_dict()).calibration_px == 0.25
     frames = noisy.frames(noisy.samples("all")[0], range(len(noisy.sequence)))
-    plain, stated = (ClassicalMethod(rig, direction="vertical").answer(frames) for rig in (noisy.rig, known))
+    plain, stated = (
+        ClassicalMethod(rig, direction="vertical").answer(frames) for rig in (noisy.rig, known)
+    )
     np.testing.assert_array_equal(stated.depth, plain.depth)
-    measured, _ = ClassicalMethod(known, direction="vertical").measure(frames)  # what neighbours are compared by
+    measured, _ = ClassicalMethod(known, direction="vertical").measure(
+        frames
+    )  # what neighbours are compared by
     found = plain.depth > 0
     assert (measured.sigma_mm[found] < plain.sigma_mm[found]).all()
     rays = tuple(axis[found] for axis in noisy.rig.camera.rays())
-    of_px = 0.25 / np.abs(coordinate_slope_px_per_mm(noisy.rig, plain.depth[found], "vertical", rays))
-    np.testing.assert_allclose(stated.sigma_mm[found], np.hypot(plain.sigma_mm[found], of_px), rtol=1e-5)
+    of_px = 0.25 / np.abs(
+        coordinate_slope_px_per_mm(noisy.rig, plain.depth[found], "vertical", rays)
+    )
+    np.testing.assert_allclose(
+        stated.sigma_mm[found], np.hypot(plain.sigma_mm[found], of_px), rtol=1e-5
+    )
     with pytest.raises(RigError, match="calibration_px: expected 0 or more"):
         replace(noisy.rig, calibration_px=-0.1)
 
@@ -111,7 +130,9 @@ def test_noise_that_light_brings_is_told_from_noise_in_the_dark():
     frames = [None] * len(rig.sequence)
     for index, turn in zip(rig.sequence.sinusoids("vertical"), turns, strict=True):
         light = bright * (1 + 0.9 * np.cos(2 * np.pi * (rows / 20 + turn)))
-        frames[index] = (light + random.normal(0, np.sqrt(0.5 + 0.02 * bright), light.shape)).astype(np.float32)
+        frames[index] = (
+            light + random.normal(0, np.sqrt(0.5 + 0.02 * bright), light.shape)
+        ).astype(np.float32)
     dark, per_grey = noise_by_light(frames, rig)
     assert dark == pytest.approx(0.5, abs=0.1)
     assert per_grey == pytest.approx(0.02, abs=0.003)
@@ -119,12 +140,14 @@ def test_noise_that_light_brings_is_told_from_noise_in_the_dark():
 
 
 def test_steps_that_do_not_divide_eighteen(noisy):
-    assert interior_rmse_mm(noisy, "both", 7) < 1.5 * interior_rmse_mm(noisy, "both", 18) * np.sqrt(18 / 7)
+    assert interior_rmse_mm(noisy, "both", 7) < 1.5 * interior_rmse_mm(noisy, "both", 18) * np.sqrt(
+        18 / 7
+    )
 
 
 def test_accuracy_in_the_papers_light(opened):
-    """With further bounces and pixels with an area: 0.31 to 1.15 mm, of which single bounced and mixed pixels bring the
-    more; 0.26 to 0.62 mm without them."""
+    """With further bounces and pixels with an area: 0.31 to 1.15 mm, of which single bounced and
+    mixed pixels bring the more; 0.26 to 0.62 mm without them."""
     classical = ClassicalMethod(opened.rig)
     for sample in opened.samples("test"):
         exact, flags = opened.depth_mm(sample, "depth_exact"), opened.flags(sample)
@@ -142,7 +165,10 @@ def test_only_the_frames_it_names_are_used(opened, direction, steps):
     classical = ClassicalMethod(opened.rig, direction=direction, steps=steps)
     used = classical.frames_used
     assert list(used) == sorted(set(used))
-    allowed = {"horizontal": {*range(18), *range(36, 43)}, "vertical": {*range(18, 36), *range(43, 50)}}
+    allowed = {
+        "horizontal": {*range(18), *range(36, 43)},
+        "vertical": {*range(18, 36), *range(43, 50)},
+    }
     named = allowed if direction == "both" else [direction]
     for name in named:
         assert len(allowed[name].intersection(used)) == steps + 7
@@ -157,7 +183,8 @@ def test_only_the_frames_it_names_are_used(opened, direction, steps):
 
 
 def test_without_a_mask_background_is_not_in_range(opened):
-    """The method is not told where the object is: the background plane at 3.2 m must come out as 0."""
+    """The method is not told where the object is: the background plane at 3.2 m must come out as
+    0."""
     sample = "bowl_A60"
     depth = ClassicalMethod(opened.rig).predict(opened.frames(sample, range(52)))
     exact = opened.depth_mm(sample, "depth_exact")
@@ -165,7 +192,9 @@ def test_without_a_mask_background_is_not_in_range(opened):
     decoded = opened.depth_mm(sample)
     both = object_mask(depth) & object_mask(decoded)
     assert both.sum() > 0.97 * object_mask(decoded).sum()
-    np.testing.assert_array_equal(depth[both], decoded[both])  # all steps, both directions: the same process
+    np.testing.assert_array_equal(
+        depth[both], decoded[both]
+    )  # all steps, both directions: the same process
 
 
 @pytest.mark.parametrize(
@@ -221,7 +250,11 @@ def test_any_rig(sequence, direction, title, frames):
     rig = rig_from_dict({**data, "sequence": {"order": ["white", *sequence, "black"], **sequence}})
     method = ClassicalMethod(rig)
     assert (method.title, method.direction, len(method.frames_used)) == (title, direction, frames)
-    assert set(method.settings) == {"direction", "steps" if "9-step" in title else "code", "threads"}
+    assert set(method.settings) == {
+        "direction",
+        "steps" if "9-step" in title else "code",
+        "threads",
+    }
     grey = np.full((TINY_SIZE, TINY_SIZE), 40, np.uint8)
     used = [grey if i in method.frames_used else None for i in range(len(rig.sequence))]
     assert not method.predict(used).any()  # nothing varies, and no frame is missing
@@ -249,13 +282,19 @@ def one_direction(code):
     ],
 )
 def test_the_phase_route_refuses_fringes_that_it_would_take_for_others(changes, options, said):
-    rig = one_direction({key: value for key, value in {**UNIT_CUE, **changes}.items() if value is not None})
+    rig = one_direction(
+        {key: value for key, value in {**UNIT_CUE, **changes}.items() if value is not None}
+    )
     with pytest.raises(PredictionError, match=said):
         load_method("phase", rig, **options)
 
 
 def test_the_phase_route_takes_the_only_direction_that_a_rig_has():
-    assert load_method("phase", one_direction({**UNIT_CUE, "sign": 1}), frames=3).frames_used == (1, 2, 3)
+    assert load_method("phase", one_direction({**UNIT_CUE, "sign": 1}), frames=3).frames_used == (
+        1,
+        2,
+        3,
+    )
     assert load_method("phase", one_direction(UNIT_CUE)).settings["direction"] == "vertical"
     assert load_method("constant", one_direction(UNIT_CUE)).frames_used == (1,)
 
@@ -272,13 +311,22 @@ def test_methods_by_name(opened):
         "constant",
         "nearest",
     )
-    assert load_method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
+    assert (
+        load_method("classical", opened.rig, steps=4).title
+        == "Classical 4-step + Gray code, both directions"
+    )
     network = load_method("unet-individual-rmse", opened.rig, device="cpu")
     assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper")
     with pytest.raises(FppBenchError, match="there are classical"):
         load_method("magic", opened.rig)
-    assert network.learned_from == {"data": "train-split", "versions": ["fpp-bench-full-224 version 2"]}
-    learned = [load_method("constant", opened.rig, at=at).learned_from["data"] for at in ("standoff", "training-mean")]
+    assert network.learned_from == {
+        "data": "train-split",
+        "versions": ["fpp-bench-full-224 version 2"],
+    }
+    learned = [
+        load_method("constant", opened.rig, at=at).learned_from["data"]
+        for at in ("standoff", "training-mean")
+    ]
     assert learned == ["none", "train-split"]
     assert load_method("phase", opened.rig).learned_from == {"data": "none"}
 
@@ -292,7 +340,10 @@ def test_prediction_folder(opened, tmp_path):
     seconds = predict_split(opened, classical, "validation", out, samples_done.append)
     assert seconds > 0 and samples_done == [1] * 6
     assert sorted(p.name for p in out.iterdir()) == sorted(
-        [*(f"mug_A{a}{end}" for a in range(0, 360, 60) for end in (".npy", ".sigma.npy")), "submission.yaml"]
+        [
+            *(f"mug_A{a}{end}" for a in range(0, 360, 60) for end in (".npy", ".sigma.npy")),
+            "submission.yaml",
+        ]
     )
     for sample in opened.samples("validation"):
         depth = np.load(out / f"{sample}.npy")
@@ -300,7 +351,10 @@ def test_prediction_folder(opened, tmp_path):
         np.testing.assert_array_equal(depth, classical.predict(opened.frames(sample, range(52))))
     submission = yaml.safe_load((out / "submission.yaml").read_text())
     assert submission["frames_used"] == list(classical.frames_used) and submission["units"] == "mm"
-    assert submission["uses_ground_truth_range"] is False and submission["seconds_source"] == "measured"
+    assert (
+        submission["uses_ground_truth_range"] is False
+        and submission["seconds_source"] == "measured"
+    )
     assert submission["settings"] == {"direction": "vertical", "steps": 4, "threads": 1}
     assert submission["seconds_per_sample"] == pytest.approx(seconds, rel=1e-4)
 
@@ -319,7 +373,9 @@ def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
         name, title, frames_used = "spy", "Spy", (0, 20)
 
         def predict(self, frames):
-            assert [i for i, f in enumerate(frames) if f is not None] == [0, 20] and len(frames) == 52
+            assert [i for i, f in enumerate(frames) if f is not None] == [0, 20] and len(
+                frames
+            ) == 52
             frames[0][:] = 0  # a method may work in place: the dataset is not its to change
             return np.ones(opened.size, np.float32)
 
@@ -379,4 +435,6 @@ def test_foreign_folders_are_not_taken_over(opened, tmp_path):
 
 def test_dataset_without_the_frames(dataset, tmp_path):
     with pytest.raises(DatasetError, match=r"frame 18 is not stored.*--config all"):
-        predict_split(dataset, ClassicalMethod(dataset.rig, direction="vertical"), "train", tmp_path / "out")
+        predict_split(
+            dataset, ClassicalMethod(dataset.rig, direction="vertical"), "train", tmp_path / "out"
+        )

@@ -1,4 +1,5 @@
-"""Finding methods: of this package, of an installed package, of a file, and by weights; and what is refused."""
+"""Finding methods: of this package, of an installed package, of a file, and by weights; and what is
+refused."""
 
 import sys
 from importlib import metadata
@@ -89,7 +90,10 @@ def test_a_method_of_a_file_with_its_options(mine):
         ("fixed.py:Fixed", "settings is read only"),
         ("mine.py:here", "expected a subclass of fpp_ml_bench.Method, got int"),
         ("none.py:Mine", "none.py: no such file"),
-        ("broken.py:Mine", r"broken.py: importing it failed: ZeroDivisionError: division by zero \(line 1\)"),
+        (
+            "broken.py:Mine",
+            r"broken.py: importing it failed: ZeroDivisionError: division by zero \(line 1\)",
+        ),
         ("spaces.py:Mine", "its name is 'a b'; expected text without spaces"),
     ],
 )
@@ -107,7 +111,9 @@ def test_the_code_of_a_file_is_it_its_helpers_and_its_weights(mine, monkeypatch)
     folder = Path(mine).parent
     (folder / "nets").mkdir()
     (folder / "nets" / "block.py").write_text("SIZE = 3\n")
-    (folder / "helper_of_mine.py").write_text("from nets.block import SIZE\nimport json\nWEIGHTS = 'own.npz'\n")
+    (folder / "helper_of_mine.py").write_text(
+        "from nets.block import SIZE\nimport json\nWEIGHTS = 'own.npz'\n"
+    )
     (folder / "own.npz").write_bytes(b"1")
     (folder / "mine.py").write_text(f"import helper_of_mine\n{MINE}")
     (folder / "unused.py").write_text("")
@@ -130,9 +136,13 @@ def test_the_code_and_the_files_of_options_are_settings(mine, tmp_path):
     (tmp_path / "again").mkdir()
     (tmp_path / "again" / "mine.py").write_text(MINE)
     again = load_method(tmp_path / "again" / "mine.py:Mine", RIG)
-    assert again.settings["source_sha256"] == first and list(again.code) == ["mine.py"]  # wherever it lies
+    assert again.settings["source_sha256"] == first and list(again.code) == [
+        "mine.py"
+    ]  # wherever it lies
     (tmp_path / "again" / "more.py").write_text(MINE + "class Other(Mine):\n    pass\n")
-    classes = [load_method(tmp_path / "again" / f"more.py:{name}", RIG) for name in ("Mine", "Other")]
+    classes = [
+        load_method(tmp_path / "again" / f"more.py:{name}", RIG) for name in ("Mine", "Other")
+    ]
     assert len({first, *(method.settings["source_sha256"] for method in classes)}) == 3
     mask = tmp_path / "mask.png"
     masks = []
@@ -155,7 +165,9 @@ def test_what_a_file_does_not_say_is_unknown(mine, tmp_path):
         f"import cv2\nfrom fpp_ml_bench.baselines.phase.method import PhaseMethod\n{MINE}"
         f"{STATED}class Trained(PhaseMethod):\n    name = 'trained'\n"
     )
-    silent, stated, trained = (load_method(tmp_path / f"stated.py:{n}", RIG) for n in ("Mine", "Stated", "Trained"))
+    silent, stated, trained = (
+        load_method(tmp_path / f"stated.py:{n}", RIG) for n in ("Mine", "Stated", "Trained")
+    )
     assert silent.learned_from is None and trained.learned_from is None  # whatever it inherits from
     assert stated.learned_from == {"data": "other", "versions": ["my scans"]}
     assert {"numpy", "cv2"} <= silent.software.keys() and {"scipy", "cv2"} <= stated.software.keys()
@@ -163,7 +175,9 @@ def test_what_a_file_does_not_say_is_unknown(mine, tmp_path):
 
 
 def test_a_file_without_its_class_is_told_what_there_is(mine):
-    with pytest.raises(PredictionError, match=r"mine.py:NAME, which says what of it; there are .*Mine"):
+    with pytest.raises(
+        PredictionError, match=r"mine.py:NAME, which says what of it; there are .*Mine"
+    ):
         find(mine)
 
 
@@ -198,7 +212,12 @@ def test_methods_of_installed_packages(monkeypatch):
     def offered(group: str) -> list[SimpleNamespace]:
         assert group == "fpp_ml_bench.methods"
         broken = entry("broken", lambda: 1 / 0)
-        return [entry("one", lambda: Installed), entry("taken", lambda: Taken), broken, entry("no", lambda: 3)]
+        return [
+            entry("one", lambda: Installed),
+            entry("taken", lambda: Taken),
+            broken,
+            entry("no", lambda: 3),
+        ]
 
     monkeypatch.setattr(metadata, "entry_points", offered)
     registry._installed.cache_clear()
@@ -206,7 +225,11 @@ def test_methods_of_installed_packages(monkeypatch):
         assert [*methods()][-2:] == ["nearest", "installed"]
         assert load_method("installed", RIG).title == "Of a package"
         assert load_method("phase", RIG).title.startswith("Phase route")
-        for name, says in (("broken", "ZeroDivisionError"), ("taken", "name 'phase' is taken"), ("no", "got int")):
+        for name, says in (
+            ("broken", "ZeroDivisionError"),
+            ("taken", "name 'phase' is taken"),
+            ("no", "got int"),
+        ):
             with pytest.raises(PredictionError, match=says):
                 find(name)
     finally:
@@ -214,7 +237,9 @@ def test_methods_of_installed_packages(monkeypatch):
 
 
 def test_a_name_that_is_almost_right():
-    with pytest.raises(PredictionError, match=r"unknown method 'phase-nte'; did you mean 'phase-net'\?"):
+    with pytest.raises(
+        PredictionError, match=r"unknown method 'phase-nte'; did you mean 'phase-net'\?"
+    ):
         find("phase-nte")
     with pytest.raises(PredictionError, match="there are classical, classical-net, phase"):
         find("something else")
@@ -226,4 +251,6 @@ def test_a_method_says_what_it_needs_to(method):
     assert method.purpose and method.name
     for options in filter(None, (method.Options, method.Training)):
         assert all(described(entry).help for entry in options_of(options))
-    assert all(set(options) <= set(method.Options.__dataclass_fields__) for options in method.variants(RIG))
+    assert all(
+        set(options) <= set(method.Options.__dataclass_fields__) for options in method.variants(RIG)
+    )

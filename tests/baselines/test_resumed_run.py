@@ -1,4 +1,5 @@
-"""`predict_split` continues a stopped run behind its last finished sample, and refuses to continue another one."""
+"""`predict_split` continues a stopped run behind its last finished sample, and refuses to continue
+another one."""
 
 import sys
 
@@ -19,8 +20,8 @@ SPLIT = "test"
 
 
 class Counting(Method):
-    """Answers the number of its answer, states a sigma, reports, and is stopped after so many answers: the first warms
-    it up."""
+    """Answers the number of its answer, states a sigma, reports, and is stopped after so many
+    answers: the first warms it up."""
 
     name, title, frames_used, settings = "counting", "Counting", (0,), {"level": 1}
     reports = True
@@ -47,7 +48,11 @@ def stopped(dataset, tmp_path):
 
 
 def test_it_goes_on_behind_the_last_finished_sample(dataset, stopped):
-    names = [f"{sample}{suffix}" for sample in dataset.samples(SPLIT)[:2] for suffix in (".npy", ".sigma.npy")]
+    names = [
+        f"{sample}{suffix}"
+        for sample in dataset.samples(SPLIT)[:2]
+        for suffix in (".npy", ".sigma.npy")
+    ]
     assert sorted(path.name for path in stopped.iterdir()) == sorted([*names, "unfinished.jsonl"])
     written = {name: (stopped / name).stat().st_mtime_ns for name in names}
     (stopped / "wooden_boards_A0.tmp").write_bytes(b"half")
@@ -60,11 +65,16 @@ def test_it_goes_on_behind_the_last_finished_sample(dataset, stopped):
     reports = read_json(stopped / "per_sample.json")
     assert [report["number"] for report in reports.values()] == [2, 3, 2, 3]
     submission = yaml.safe_load((stopped / "submission.yaml").read_text())
-    assert submission["settings"] == {"level": 1, "mean_number": 2.5} and "learned_from" not in submission
+    assert (
+        submission["settings"] == {"level": 1, "mean_number": 2.5}
+        and "learned_from" not in submission
+    )
     assert evaluate(stopped, dataset).uncertainty is not None
 
 
-@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(path.read_bytes()[:200])])
+@pytest.mark.parametrize(
+    "damage", [lambda path: path.unlink(), lambda path: path.write_bytes(path.read_bytes()[:200])]
+)
 def test_a_finished_sample_whose_file_is_gone_or_cut_is_predicted_again(damage, dataset, stopped):
     damage(stopped / f"{dataset.samples(SPLIT)[0]}.npy")
     method = Counting()
@@ -86,7 +96,9 @@ def test_another_run_is_refused_and_keeps_its_files(dataset, stopped):
     before = {path.name: path.read_bytes() for path in stopped.iterdir()}
     other = Counting()
     other.settings = {"level": 2}
-    with pytest.raises(PredictionError, match=r"differs in settings level \(settings level: 1 there, 2 now\)"):
+    with pytest.raises(
+        PredictionError, match=r"differs in settings level \(settings level: 1 there, 2 now\)"
+    ):
         predict_split(dataset, other, SPLIT, stopped)
     with pytest.raises(PredictionError, match="differs in split"):
         predict_split(dataset, Counting(), "validation", stopped)
@@ -104,7 +116,9 @@ def test_other_code_is_refused_by_the_name_of_its_file(dataset, tmp_path):
         predict_split(dataset, method, SPLIT, tmp_path / "out")
     changed = Counting()
     changed.code = {"mine.py": "1", "util.py": "2"}
-    with pytest.raises(PredictionError, match=r'differs in code util\.py \(code util\.py: "1" there, "2" now\)'):
+    with pytest.raises(
+        PredictionError, match=r'differs in code util\.py \(code util\.py: "1" there, "2" now\)'
+    ):
         predict_split(dataset, changed, SPLIT, tmp_path / "out")
     same = Counting()
     same.code = method.code
@@ -117,7 +131,9 @@ def test_other_threads_are_refused(dataset, stopped, monkeypatch):
         predict_split(dataset, Counting(), SPLIT, stopped)
 
 
-def test_a_method_that_describes_itself_wrongly_is_refused_before_its_first_sample(dataset, tmp_path):
+def test_a_method_that_describes_itself_wrongly_is_refused_before_its_first_sample(
+    dataset, tmp_path
+):
     method = Counting()
     method.learned_from = {"data": "mine"}
     with pytest.raises(SubmissionError, match="learned_from"):
@@ -152,7 +168,9 @@ class Looking(Method):
         return Answer(np.zeros(frames[0].shape, np.float32))
 
 
-def test_a_method_reaches_no_truth_by_what_it_is_given_or_by_its_caller(dataset, tmp_path, monkeypatch):
+def test_a_method_reaches_no_truth_by_what_it_is_given_or_by_its_caller(
+    dataset, tmp_path, monkeypatch
+):
     monkeypatch.setattr(registry, "_built_in", {"looking": Looking}.get)
     monkeypatch.setattr(registry, "BUILT_IN", ("looking",))
     monkeypatch.setattr(registry, "NETWORKS", "looking")

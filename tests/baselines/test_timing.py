@@ -1,4 +1,5 @@
-"""Timing a method: the arithmetic against a clock of our own, memory against a known array, and where it is written."""
+"""Timing a method: the arithmetic against a clock of our own, memory against a known array, and
+where it is written."""
 
 from dataclasses import dataclass, field
 
@@ -48,15 +49,23 @@ def test_latency_is_that_of_the_runs_after_warm_up(dataset, monkeypatch):
     clock = Clock()
     monkeypatch.setattr(timing, "perf_counter", clock)
     runs = [0.001 * n for n in range(1, 12)]
-    # Warm-up and the memory run are slow and must not show; then eleven runs; then three batches of four.
+    # Warm-up and the memory run are slow and must not show; then eleven runs; then three batches of
+    # four.
     method = Scripted(clock, [100.0] * (timing.WARM_UP + 1) + runs[::-1] + [0.25] * 16)
     steps = []
     measured = timing.time_method(dataset, method, batch=4, repeats=11, progress=steps.append)
     assert measured.latency_median_ms == 6.0 and measured.repeats == 11 == len(steps)
-    assert (measured.latency_p5_ms, measured.latency_p95_ms) == (1.5, 10.5)  # numpy's linear interpolation of 1..11
+    assert (measured.latency_p5_ms, measured.latency_p95_ms) == (
+        1.5,
+        10.5,
+    )  # numpy's linear interpolation of 1..11
     assert measured.throughput_per_s == 4.0 and measured.batch == 4 and measured.batched is False
     assert measured.parameters == 1234 and measured.frames == 1 and measured.image_size == [32, 40]
-    assert measured.provenance == "measured" and measured.device == "cpu" and measured.gpu_memory_mib is None
+    assert (
+        measured.provenance == "measured"
+        and measured.device == "cpu"
+        and measured.gpu_memory_mib is None
+    )
     assert measured.hardware.cores >= 1 and "numpy" in measured.software
     for frames in method.stacks:
         assert frames[0] is not None and all(frame is None for frame in frames[1:])
@@ -75,7 +84,9 @@ def test_a_method_that_takes_batches_gets_them_at_once(dataset, monkeypatch):
             clock.now += 50.0 if len(sizes) == 1 else 0.5  # the first batch warms up
             return [np.zeros(frames[0].shape, np.float32) for frames in stacks]
 
-    measured = timing.time_method(dataset, Batched(clock, []), batch=6, repeats=12)  # the split has four
+    measured = timing.time_method(
+        dataset, Batched(clock, []), batch=6, repeats=12
+    )  # the split has four
     assert measured.batched is True and set(sizes) == {6} and len(sizes) == 3
     assert measured.throughput_per_s == 12.0
 
@@ -105,7 +116,11 @@ def test_working_memory_is_what_one_prediction_takes(dataset):
     class Hungry(Scripted):
         def predict(self, frames):
             self.clock.now += 1.0
-            return np.ones(64 * 2**20 // 4, np.float32)[: frames[0].size].reshape(frames[0].shape).copy()
+            return (
+                np.ones(64 * 2**20 // 4, np.float32)[: frames[0].size]
+                .reshape(frames[0].shape)
+                .copy()
+            )
 
     measured = timing.time_method(dataset, Hungry(Clock(), []), repeats=1, batch=1)
     if measured.working_memory_mib is None:  # a kernel without /proc/self/clear_refs
@@ -156,7 +171,9 @@ def test_a_time_is_not_written_into_another_methods_file(predicted, dataset, tmp
     arguments, work = predicted
     result_bytes = (work / "result.json").read_bytes()
     other_arguments = [*arguments[:3], "4", *arguments[4:]]
-    assert "frames_used is" in refusal(fpp_bench, "time", *other_arguments, "--into", work / "result.json")
+    assert "frames_used is" in refusal(
+        fpp_bench, "time", *other_arguments, "--into", work / "result.json"
+    )
     assert (work / "result.json").read_bytes() == result_bytes
     folder = write_predictions(tmp_path / "p", dataset)
     assert "method is test, but classical" in refusal(
@@ -165,7 +182,9 @@ def test_a_time_is_not_written_into_another_methods_file(predicted, dataset, tmp
     assert "expected a submission.yaml or a result file" in refusal(
         fpp_bench, "time", *arguments, "--into", tmp_path / "notes.txt"
     )
-    assert "does not exist" in refusal(fpp_bench, "time", *arguments, "--json", tmp_path / "no" / "t.json")
+    assert "does not exist" in refusal(
+        fpp_bench, "time", *arguments, "--json", tmp_path / "no" / "t.json"
+    )
 
 
 @pytest.mark.parametrize("value", ["0", "1e9"])
@@ -186,7 +205,9 @@ def test_counts_are_counts(value, predicted):
     ],
 )
 def test_an_unsound_block_is_refused(change, message, dataset, tmp_path):
-    block = timing.time_method(dataset, Scripted(Clock(), [0.5] * 99), repeats=2).model_dump(mode="json")
+    block = timing.time_method(dataset, Scripted(Clock(), [0.5] * 99), repeats=2).model_dump(
+        mode="json"
+    )
     folder = write_predictions(tmp_path / "p", dataset, timing=block)
     assert read_submission(folder).timing is not None
     content = yaml.safe_load((folder / "submission.yaml").read_text())

@@ -32,24 +32,35 @@ def dataset(tmp_path_factory):
 
 def test_the_nearest_of_the_training_images_by_another_computation(dataset):
     method = NearestMethod(paper_rig(96), training=dataset)
-    training = {sample: dataset.frame(sample, 0).astype(float) for sample in dataset.samples("train")}
+    training = {
+        sample: dataset.frame(sample, 0).astype(float) for sample in dataset.samples("train")
+    }
     chosen = set()
     for sample in dataset.samples("test"):
         image = dataset.frame(sample, 0).astype(float)
         nearest = min(training, key=lambda name: float(((training[name] - image) ** 2).mean()))
-        np.testing.assert_array_equal(method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(nearest))
+        np.testing.assert_array_equal(
+            method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(nearest)
+        )
         chosen.add(nearest)
     assert len(chosen) > 1
     for sample in training:  # its own image is the nearest
-        np.testing.assert_array_equal(method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(sample))
+        np.testing.assert_array_equal(
+            method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(sample)
+        )
 
 
 def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):
     assert fpp_bench("predict", "nearest", dataset.path, "--out", tmp_path / "p") == 0
     text = (tmp_path / "p" / "submission.yaml").read_text()
     assert "method: nearest" in text and f"training_fingerprint: {dataset.fingerprint}" in text
-    assert f"learned_from:\n  data: train-split\n  versions:\n  - dataset {dataset.fingerprint[:8]}\n" in text
-    predict_split(dataset, NearestMethod(dataset.rig, training=dataset.path), "test", tmp_path / "q")
+    assert (
+        f"learned_from:\n  data: train-split\n  versions:\n  - dataset {dataset.fingerprint[:8]}\n"
+        in text
+    )
+    predict_split(
+        dataset, NearestMethod(dataset.rig, training=dataset.path), "test", tmp_path / "q"
+    )
     assert len(list((tmp_path / "q").glob("*.npy"))) == 8
 
 
@@ -66,17 +77,25 @@ def test_what_can_not_be_searched_is_refused(dataset, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("at", "depth_mm"), [("standoff", 1800.0), ("middle", 1800.0), ("training-mean", 1743.75), (5.0, 5.0)]
+    ("at", "depth_mm"),
+    [("standoff", 1800.0), ("middle", 1800.0), ("training-mean", 1743.75), (5.0, 5.0)],
 )
 def test_a_constant_is_one_depth(at, depth_mm):
     depth = ConstantMethod(paper_rig(16), at=at).predict([])
-    assert depth.shape == (16, 16) and depth.dtype == np.float32 and np.unique(depth).tolist() == [depth_mm]
+    assert (
+        depth.shape == (16, 16)
+        and depth.dtype == np.float32
+        and np.unique(depth).tolist() == [depth_mm]
+    )
 
 
 @pytest.mark.parametrize(("at", "share"), [("range-middle", 0.5), ("range-training", 0.294)])
 def test_a_constant_that_is_told_the_range_is_a_share_of_it(at, share, dataset, tmp_path):
     method = ConstantMethod(dataset.rig, at=at)
-    assert np.unique(method.predict([])).tolist() == [np.float32(share)] and method.units == "normalised"
+    assert (
+        np.unique(method.predict([])).tolist() == [np.float32(share)]
+        and method.units == "normalised"
+    )
     assert method.learned_from["data"] == ("none" if at == "range-middle" else "train-split")
     predict_split(dataset, method, "test", tmp_path / "p")
     result = evaluate(tmp_path / "p", dataset, mode="paper")

@@ -13,7 +13,8 @@ SIZE, FINE = (330, 300), 6
 
 
 def _drawn(board):
-    """The board as a camera sees it: averaged over sub-pixels, blurred, with noise and uneven light; 8 bits."""
+    """The board as a camera sees it: averaged over sub-pixels, blurred, with noise and uneven
+    light; 8 bits."""
     width, height = SIZE
     y, x = (np.mgrid[0 : height * FINE, 0 : width * FINE] + 0.5) / FINE - 0.5
     flat = np.linalg.inv(TO_IMAGE) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
@@ -25,8 +26,12 @@ def _drawn(board):
     else:
         centres = board.points_mm()[:, :2] / board.spacing_mm
         radius = board.radius_mm / board.spacing_mm
-        dark = np.any([np.hypot(*(place - centre[:, None, None])) < radius for centre in centres], axis=0)
-    grey = 30 + 120 * (1 - dark).reshape(height, FINE, width, FINE).mean((1, 3)) * np.linspace(1, 0.7, width)
+        dark = np.any(
+            [np.hypot(*(place - centre[:, None, None])) < radius for centre in centres], axis=0
+        )
+    grey = 30 + 120 * (1 - dark).reshape(height, FINE, width, FINE).mean((1, 3)) * np.linspace(
+        1, 0.7, width
+    )
     noise = np.random.default_rng(1).normal(0, 1, grey.shape)
     return np.clip(np.rint(cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), 0, 255).astype(np.uint8)
 
@@ -37,7 +42,8 @@ def _images_of(points):
 
 
 def _centroids_of(board):
-    """Centroids of the images of circles: centres of ellipses, from the dual conic of each circle."""
+    """Centroids of the images of circles: centres of ellipses, from the dual conic of each
+    circle."""
     centres = []
     for x, y, _ in board.points_mm():
         to_circle = np.array([[board.radius_mm, 0, x], [0, board.radius_mm, y], [0, 0, 1]])
@@ -48,7 +54,11 @@ def _centroids_of(board):
 
 @pytest.mark.parametrize(
     "text, tolerance_px",
-    [("checker:7x5:10", 0.06), ("circles:7x5:10:2.5", 0.06), ("circles-asymmetric:4x7:8:2.5", 0.06)],
+    [
+        ("checker:7x5:10", 0.06),
+        ("circles:7x5:10:2.5", 0.06),
+        ("circles-asymmetric:4x7:8:2.5", 0.06),
+    ],
 )
 def test_drawn_boards_are_found(text, tolerance_px):
     board = parse_board(text)
@@ -65,7 +75,9 @@ def test_drawn_boards_are_found(text, tolerance_px):
 def test_a_charuco_board_is_found_and_may_be_partly_hidden(hidden):
     board = parse_board("charuco:5x6:10:7:DICT_5X5_50")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
-    image = cv2.aruco.CharucoBoard((6, 7), 10.0, 7.0, dictionary).generateImage((480, 560), marginSize=0)
+    image = cv2.aruco.CharucoBoard((6, 7), 10.0, 7.0, dictionary).generateImage(
+        (480, 560), marginSize=0
+    )
     image = cv2.copyMakeBorder(image, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
     if hidden:
         image[:, :200] = 255
@@ -76,7 +88,9 @@ def test_a_charuco_board_is_found_and_may_be_partly_hidden(hidden):
 
 def _charuco(columns, rows, before_4_6):
     """Squares of 40 px in a margin of 40 px, and where the inner corners are."""
-    drawn = cv2.aruco.CharucoBoard((columns + 1, rows + 1), 10.0, 7.0, cv2.aruco.getPredefinedDictionary(MARKERS))
+    drawn = cv2.aruco.CharucoBoard(
+        (columns + 1, rows + 1), 10.0, 7.0, cv2.aruco.getPredefinedDictionary(MARKERS)
+    )
     drawn.setLegacyPattern(before_4_6)
     image = drawn.generateImage((40 * (columns + 1), 40 * (rows + 1)))
     row, column = np.divmod(np.arange(columns * rows), columns)
@@ -92,21 +106,55 @@ def test_markers_may_lie_as_before_opencv_4_6(rows, before_4_6):
     image, expected = _charuco(7, rows, before_4_6)
     image[:, 300:] = 255
     corners = parse_board(f"charuco:7x{rows}:10:7:DICT_5X5_50").find(image)
-    assert np.isfinite(corners).all(axis=1).sum() >= 8 and np.nanmax(np.abs(corners - expected)) < 0.5
+    assert (
+        np.isfinite(corners).all(axis=1).sum() >= 8 and np.nanmax(np.abs(corners - expected)) < 0.5
+    )
 
 
 @pytest.mark.parametrize(
     "text, change, seen",
     [
-        ("checker:7x5:10", lambda image: image[:, :-75], r"seen: 30 corners of a checker \(6 x 5\), in columns 90"),
-        ("checker:9x5:10", lambda image: image, r"seen: 35 corners of a checker \(7 x 5\), in columns 90"),
-        ("checker:7x5:10", lambda image: image[:90], "seen: no corners of a checker; the image has grey levels"),
-        ("circles:7x5:10:2.5", lambda image: image[:, 100:], r"seen: 30 dots, in columns \d+ to \d+ and rows"),
+        (
+            "checker:7x5:10",
+            lambda image: image[:, :-75],
+            r"seen: 30 corners of a checker \(6 x 5\), in columns 90",
+        ),
+        (
+            "checker:9x5:10",
+            lambda image: image,
+            r"seen: 35 corners of a checker \(7 x 5\), in columns 90",
+        ),
+        (
+            "checker:7x5:10",
+            lambda image: image[:90],
+            "seen: no corners of a checker; the image has grey levels",
+        ),
+        (
+            "circles:7x5:10:2.5",
+            lambda image: image[:, 100:],
+            r"seen: 30 dots, in columns \d+ to \d+ and rows",
+        ),
         ("circles:7x5:10:2.5", lambda image: 255 - image[:, 100:], "seen: 30 dots, in"),
-        ("charuco:7x5:10:7", lambda image: image, r"24 markers of DICT_5X5_1000, .* has 24 of DICT_4X4_1000\), in col"),
-        ("charuco:7x5:10:7:DICT_5X5_50", lambda image: image[:, ::-1], "24 markers of DICT_5X5_50 in the mirrored"),
-        ("charuco:8x6:10:7:DICT_5X5_50", lambda image: image, r"24 markers .* numbered 0 to 23 \(the board has 31\)"),
-        ("charuco:7x5:10:7:DICT_5X5_50", lambda image: image[:60], "seen: no markers of DICT_5X5_50; the image has"),
+        (
+            "charuco:7x5:10:7",
+            lambda image: image,
+            r"24 markers of DICT_5X5_1000, .* has 24 of DICT_4X4_1000\), in col",
+        ),
+        (
+            "charuco:7x5:10:7:DICT_5X5_50",
+            lambda image: image[:, ::-1],
+            "24 markers of DICT_5X5_50 in the mirrored",
+        ),
+        (
+            "charuco:8x6:10:7:DICT_5X5_50",
+            lambda image: image,
+            r"24 markers .* numbered 0 to 23 \(the board has 31\)",
+        ),
+        (
+            "charuco:7x5:10:7:DICT_5X5_50",
+            lambda image: image[:60],
+            "seen: no markers of DICT_5X5_50; the image has",
+        ),
     ],
 )
 def test_of_a_board_that_is_not_found_it_is_said_what_was_seen(text, change, seen):
@@ -131,11 +179,18 @@ def test_points():
         [0, 2.5, 0],
         [5, 7.5, 0],
     ]
-    assert Board("circles-asymmetric", 3, 4, 2.0).points_mm()[[0, 1, 3]].tolist() == [[0, 0, 0], [4, 0, 0], [2, 2, 0]]
+    assert Board("circles-asymmetric", 3, 4, 2.0).points_mm()[[0, 1, 3]].tolist() == [
+        [0, 0, 0],
+        [4, 0, 0],
+        [2, 2, 0],
+    ]
 
 
 def test_an_absent_board_is_named():
-    with pytest.raises(CalibrationError, match="pose 7: the board checker:9x6:10 was not found; expected 9 x 6 inner"):
+    with pytest.raises(
+        CalibrationError,
+        match="pose 7: the board checker:9x6:10 was not found; expected 9 x 6 inner",
+    ):
         parse_board("checker:9x6:10").find(np.full((120, 160), 90, np.uint8), "pose 7")
     with pytest.raises(CalibrationError, match="8-bit grey image, got float64"):
         parse_board("checker:9x6:10").find(np.zeros((120, 160)))

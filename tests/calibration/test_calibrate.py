@@ -1,4 +1,5 @@
-"""Calibration of rigs that OpenCV projected: exact points, noise, circles, irregular boards, and what is refused."""
+"""Calibration of rigs that OpenCV projected: exact points, noise, circles, irregular boards, and
+what is refused."""
 
 import cv2
 import numpy as np
@@ -29,8 +30,13 @@ def _values(calibration):
         pinhole = device.pinhole
         values += [*pinhole.focal, *pinhole.centre, *pinhole.distortion]
         sigmas += device.sigma
-    values += [*cv2.Rodrigues(np.array(calibration.rotation))[0].ravel(), *calibration.translation_mm]
-    return np.array(values), np.array([*sigmas, *calibration.rotation_sigma_rad, *calibration.translation_sigma_mm])
+    values += [
+        *cv2.Rodrigues(np.array(calibration.rotation))[0].ravel(),
+        *calibration.translation_mm,
+    ]
+    return np.array(values), np.array(
+        [*sigmas, *calibration.rotation_sigma_rad, *calibration.translation_sigma_mm]
+    )
 
 
 def test_exact_points_give_the_exact_rig():
@@ -39,7 +45,10 @@ def test_exact_points_give_the_exact_rig():
     np.testing.assert_allclose(_values(calibration)[0], _truth(), rtol=1e-6, atol=1e-7)
     assert calibration.camera.pinhole.fx == pytest.approx(1500, abs=1e-4)
     rig = Rig(
-        calibration.camera.pinhole, calibration.projector.pinhole, calibration.rotation, calibration.translation_m
+        calibration.camera.pinhole,
+        calibration.projector.pinhole,
+        calibration.rotation,
+        calibration.translation_m,
     )
     assert rig.baseline_m * 1000 == pytest.approx(calibration.baseline_mm)
 
@@ -63,9 +72,13 @@ def test_noisier_projector_coordinates_weigh_less():
     for pose in poses:
         points = pose.projector.points_px + rng.normal(0, 0.4, pose.corners_px.shape)
         sigma = np.full_like(points, 0.4)
-        noisy.append(pose._replace(projector=pose.projector._replace(points_px=points, sigma_px=sigma)))
+        noisy.append(
+            pose._replace(projector=pose.projector._replace(points_px=points, sigma_px=sigma))
+        )
     calibration = calibrate(noisy, BOARD, *SIZES, hold_out=False)
-    assert calibration.noise_px[0] == pytest.approx(0.05, rel=0.12) and calibration.noise_px[1] < 0.15
+    assert (
+        calibration.noise_px[0] == pytest.approx(0.05, rel=0.12) and calibration.noise_px[1] < 0.15
+    )
     values, sigmas = _values(calibration)
     assert np.abs((values - _truth()) / sigmas).max() < 4
 
@@ -91,8 +104,12 @@ def test_a_given_baseline_sets_the_scale():
     factor = 200.0 / free.baseline_mm
     assert scaled.baseline_mm == pytest.approx(200.0)
     spacing_mm = np.linalg.norm(scaled.board_mm[1] - scaled.board_mm[0])
-    assert spacing_mm == pytest.approx(18 * factor) and "from the baseline of 200 mm" in scaled.scale
-    np.testing.assert_allclose(scaled.poses[2].translation_mm, factor * np.array(free.poses[2].translation_mm))
+    assert (
+        spacing_mm == pytest.approx(18 * factor) and "from the baseline of 200 mm" in scaled.scale
+    )
+    np.testing.assert_allclose(
+        scaled.poses[2].translation_mm, factor * np.array(free.poses[2].translation_mm)
+    )
     assert scaled.rms_px.both == pytest.approx(free.rms_px.both, rel=1e-9)
 
 
@@ -109,10 +126,15 @@ def test_the_bias_of_circles_is_taken_off(radius_known):
         centres, shown = rigs.project(points, index)
         step = edges - edges.mean(1, keepdims=True)
         following = np.roll(step, -1, axis=1)
-        area = (step[..., 0] * following[..., 1] - step[..., 1] * following[..., 0]) / 2  # of triangles at the mean
-        centroids = edges.mean(1) + ((step + following) / 3 * area[..., None]).sum(1) / area.sum(1)[:, None]
+        area = (
+            step[..., 0] * following[..., 1] - step[..., 1] * following[..., 0]
+        ) / 2  # of triangles at the mean
+        centroids = (
+            edges.mean(1) + ((step + following) / 3 * area[..., None]).sum(1) / area.sum(1)[:, None]
+        )
         bias.append(centroids - centres)
-        # What a fit round the centroid would read: the projector's coordinate moves along with the image position.
+        # What a fit round the centroid would read: the projector's coordinate moves along with the
+        # image position.
         jacobian = projector_jacobian(points, index)
         shown = shown + np.einsum("nij,nj->ni", jacobian, centroids - centres)
         projector = ProjectorPoints(shown, np.zeros_like(shown), jacobian, {})
@@ -121,7 +143,9 @@ def test_the_bias_of_circles_is_taken_off(radius_known):
     calibration = calibrate(poses, board, *SIZES, hold_out=False)
     error = np.abs(_values(calibration)[0] - _truth())
     if radius_known:
-        assert calibration.rms_px.both < 1e-4 and error[:2].max() < 0.01 and error[-3:].max() < 0.002
+        assert (
+            calibration.rms_px.both < 1e-4 and error[:2].max() < 0.01 and error[-3:].max() < 0.002
+        )
     else:
         assert error[:2].max() > 0.1  # which the residuals don't show
 
@@ -135,7 +159,10 @@ def projector_jacobian(points, index, step_mm=0.01):
     """Change of projector coordinates with the image position, through small steps on the board."""
     slopes = []
     for axis in range(2):
-        ends = [rigs.project(points + sign * step_mm * np.eye(3)[axis], index, middle=points) for sign in (1, -1)]
+        ends = [
+            rigs.project(points + sign * step_mm * np.eye(3)[axis], index, middle=points)
+            for sign in (1, -1)
+        ]
         slopes.append([(ends[0][device] - ends[1][device]) / (2 * step_mm) for device in range(2)])
     to_image = np.stack([slopes[0][0], slopes[1][0]], axis=-1)
     to_projector = np.stack([slopes[0][1], slopes[1][1]], axis=-1)
@@ -148,13 +175,20 @@ def test_an_irregular_board_is_estimated_whatever_its_labels():
     poses = rigs.poses(irregular, noise_px=0.03)
     for index in (1, 4):
         points = poses[index].projector
-        turned = ProjectorPoints(points.points_px[::-1], points.sigma_px[::-1], points.jacobian[::-1], {})
-        poses[index] = poses[index]._replace(corners_px=poses[index].corners_px[::-1], projector=turned)
+        turned = ProjectorPoints(
+            points.points_px[::-1], points.sigma_px[::-1], points.jacobian[::-1], {}
+        )
+        poses[index] = poses[index]._replace(
+            corners_px=poses[index].corners_px[::-1], projector=turned
+        )
     given = calibrate(poses, board, *SIZES, hold_out=False)
     estimated = calibrate(poses, board, *SIZES, estimate_board=True, hold_out=False)
     assert given.rms_px.both > 0.15 and estimated.rms_px.both < 0.045
     errors = [
-        [np.sqrt(np.mean((points - irregular)[:, :2] ** 2)) for points in (found, np.flipud(_turned(found, board)))]
+        [
+            np.sqrt(np.mean((points - irregular)[:, :2] ** 2))
+            for points in (found, np.flipud(_turned(found, board)))
+        ]
         for found in (estimated.board_mm, given.board_mm)
     ]
     assert min(errors[0]) < 0.03 < min(errors[1])
@@ -167,11 +201,16 @@ def _turned(points, board):
 
 def test_the_lens_that_was_there_predicts_best_and_a_bad_pose_is_named():
     poses = rigs.poses(BOARD.points_mm(), noise_px=0.05)
-    found = [calibrate(poses, BOARD, *SIZES, (Lens(name), Lens(name))) for name in ("radial-1", "radial-3+tangential")]
+    found = [
+        calibrate(poses, BOARD, *SIZES, (Lens(name), Lens(name)))
+        for name in ("radial-1", "radial-3+tangential")
+    ]
     found.sort(key=lambda calibration: calibration.held_out_rms_px)
     assert found[0].camera.lens.model == "radial-3+tangential"
     assert found[0].bic == min(calibration.bic for calibration in found) and found[0].spoilers == ()
-    corners = poses[3].corners_px + np.random.default_rng(1).normal(0, 0.6, poses[3].corners_px.shape)
+    corners = poses[3].corners_px + np.random.default_rng(1).normal(
+        0, 0.6, poses[3].corners_px.shape
+    )
     poses[3] = poses[3]._replace(corners_px=corners)
     assert calibrate(poses, BOARD, *SIZES).spoilers == ("pose3",)
 
@@ -188,7 +227,10 @@ def test_missing_points_are_left_out():
 
 
 def test_the_rational_lens_has_eight_terms():
-    poses, lenses = rigs.poses(BOARD.points_mm(), noise_px=0.02), (Lens("rational"), Lens("rational"))
+    poses, lenses = (
+        rigs.poses(BOARD.points_mm(), noise_px=0.02),
+        (Lens("rational"), Lens("rational")),
+    )
     calibration = calibrate(poses, BOARD, *SIZES, lenses, hold_out=False)
     assert len(calibration.camera.pinhole.distortion) == 8 and calibration.rms_px.both < 0.03
 
@@ -201,18 +243,31 @@ def _refused(poses, message, **options):
 def test_captures_that_give_no_rig_are_refused_by_name():
     poses = rigs.poses(BOARD.points_mm(), count=4)
     _refused(poses[:2], "at least 3 poses of the board, got 2")
-    _refused([poses[0]._replace(size=(640, 480)), *poses[1:]], "pose pose0: the image is 640 x 480 px")
+    _refused(
+        [poses[0]._replace(size=(640, 480)), *poses[1:]], "pose pose0: the image is 640 x 480 px"
+    )
     with pytest.raises(CalibrationError, match="expected one of none"):
         Lens("fisheye")
     _refused(poses, "baseline_mm", baseline_mm=-1.0)
     mirrored = poses[2]._replace(corners_px=poses[2].corners_px * [-1, 1] + [1279, 0])
     _refused([*poses[:2], mirrored], "pose pose2: the camera sees the board mirrored")
-    swapped = poses[1].projector._replace(points_px=poses[1].projector.points_px[:, ::-1] + [500, 0])
-    _refused([poses[0], poses[1]._replace(projector=swapped), poses[2]], "pose pose1: the board lies at projector col")
-    dark = poses[1].projector._replace(points_px=np.full((63, 2), np.nan), reasons={0: "only 3 of 80 pixels"})
-    _refused([poses[0], poses[1]._replace(projector=dark), poses[2]], r"pose pose1: only 0 of 63.*point 0: only 3 of")
+    swapped = poses[1].projector._replace(
+        points_px=poses[1].projector.points_px[:, ::-1] + [500, 0]
+    )
+    _refused(
+        [poses[0], poses[1]._replace(projector=swapped), poses[2]],
+        "pose pose1: the board lies at projector col",
+    )
+    dark = poses[1].projector._replace(
+        points_px=np.full((63, 2), np.nan), reasons={0: "only 3 of 80 pixels"}
+    )
+    _refused(
+        [poses[0], poses[1]._replace(projector=dark), poses[2]],
+        r"pose pose1: only 0 of 63.*point 0: only 3 of",
+    )
     all_named = (
-        r"(?s)2 poses can't be used.*  pose pose1: only 0 of 63 .*  pose pose2: the camera sees the board mirrored"
+        r"(?s)2 poses can't be used.*  pose pose1: only 0 of 63 .*  pose pose2: the camera sees "
+        r"the board mirrored"
     )
     _refused([poses[0], poses[1]._replace(projector=dark), mirrored], all_named)
 
@@ -223,7 +278,11 @@ def test_parallel_boards_are_refused():
         turn, shift = np.array([0.0, 0.1, 0.0]), np.array([-70.0, -60.0, distance])
         composed = cv2.composeRT(turn, shift, rigs.TURN, rigs.SHIFT_MM)
         points = BOARD.points_mm()
-        image = cv2.projectPoints(points, turn, shift, rigs.CAMERA, rigs.CAMERA_TERMS)[0].reshape(-1, 2)
-        shown = cv2.projectPoints(points, *composed[:2], rigs.PROJECTOR, rigs.PROJECTOR_TERMS)[0].reshape(-1, 2)
+        image = cv2.projectPoints(points, turn, shift, rigs.CAMERA, rigs.CAMERA_TERMS)[0].reshape(
+            -1, 2
+        )
+        shown = cv2.projectPoints(points, *composed[:2], rigs.PROJECTOR, rigs.PROJECTOR_TERMS)[
+            0
+        ].reshape(-1, 2)
         poses.append(rigs.pose(f"flat{index}", image, shown))
     _refused(poses, "poses flat0, flat1, flat2, flat3: the board is parallel in all of them")

@@ -1,4 +1,5 @@
-"""``fpp-bench calibrate`` from photographed boards, and the chain that it stands in: patterns, captures, rig, depth."""
+"""``fpp-bench calibrate`` from photographed boards, and the chain that it stands in: patterns,
+captures, rig, depth."""
 
 import shutil
 
@@ -23,10 +24,24 @@ def calibrate(*words):
 def virtual(tmp_path_factory):
     """Five poses at 240 px with three steps and their Gray code; the rig found from them."""
     folder = tmp_path_factory.mktemp("virtual")
-    data = {**paper_rig(SIZE).to_dict(), "sequence": {"steps": 3, "bits_horizontal": 7, "bits_vertical": 7}}
+    data = {
+        **paper_rig(SIZE).to_dict(),
+        "sequence": {"steps": 3, "bits_horizontal": 7, "bits_vertical": 7},
+    }
     (folder / "true.yaml").write_text(yaml.safe_dump(data))
     words = ("--true-rig", folder / "true.yaml", "--poses", 5, "--out", folder / "found.yaml")
-    assert calibrate("--virtual", folder / "boards", *words, "--lens", "none", "--opencv", folder / "found.xml") == 0
+    assert (
+        calibrate(
+            "--virtual",
+            folder / "boards",
+            *words,
+            "--lens",
+            "none",
+            "--opencv",
+            folder / "found.xml",
+        )
+        == 0
+    )
     return folder
 
 
@@ -41,11 +56,24 @@ def test_the_paper_s_calibration_finds_the_rig_that_photographed(virtual, capsys
 
 def test_a_second_run_photographs_nothing_and_says_how_far_it_is_from_the_truth(virtual, capsys):
     before = {path: path.stat().st_mtime_ns for path in (virtual / "boards").rglob("*.png")}
-    words = ("--true-rig", virtual / "true.yaml", "--poses", 5, "--out", virtual / "again.yaml", "--lens", "none")
+    words = (
+        "--true-rig",
+        virtual / "true.yaml",
+        "--poses",
+        5,
+        "--out",
+        virtual / "again.yaml",
+        "--lens",
+        "none",
+    )
     assert calibrate("--virtual", virtual / "boards", *words) == 0
     assert before == {path: path.stat().st_mtime_ns for path in (virtual / "boards").rglob("*.png")}
     printed = capsys.readouterr()
-    assert "against truth" in printed.out and "warning:" not in printed.err and "note:" not in printed.err
+    assert (
+        "against truth" in printed.out
+        and "warning:" not in printed.err
+        and "note:" not in printed.err
+    )
     first, again = (load_rig(virtual / f"{name}.yaml") for name in ("found", "again"))
     assert again.baseline_m == pytest.approx(first.baseline_m, rel=1e-9)
 
@@ -54,7 +82,14 @@ def test_from_captures_a_wrong_spacing_scales_the_rig(virtual, tmp_path):
     board = yaml.safe_load((virtual / "boards" / "board.yaml").read_text())["board"]
     kind, grid, spacing, radius = board.split(":")
     small = f"{kind}:{grid}:{0.95 * float(spacing)}:{0.95 * float(radius)}"
-    words = ("--sequence", virtual / "boards" / "rig.yaml", "--lens", "none", "--out", tmp_path / "rig.yaml")
+    words = (
+        "--sequence",
+        virtual / "boards" / "rig.yaml",
+        "--lens",
+        "none",
+        "--out",
+        tmp_path / "rig.yaml",
+    )
     assert calibrate(virtual / "boards", "--board", small, *words) == 0
     found, right = load_rig(tmp_path / "rig.yaml"), load_rig(virtual / "found.yaml")
     assert found.baseline_m / right.baseline_m == pytest.approx(0.95, abs=2e-3)
@@ -68,16 +103,30 @@ def test_from_captures_a_wrong_spacing_scales_the_rig(virtual, tmp_path):
         (("BOARDS",), "need --board"),
         (("BOARDS", "--board", "circles:5x9:50:15"), "need --board"),
         (("BOARDS", "--board", "circles:7x9:50:15", "--sequence", "TRUE"), "was not found"),
-        (("BOARDS", "--board", "BOARD", "--sequence", "TRUE", "--baseline", "-1"), "baseline_mm: expected a positive"),
-        (("BOARDS", "--board", "BOARD", "--sequence", "other.yaml"), "expected 52 frames, found 22"),
+        (
+            ("BOARDS", "--board", "BOARD", "--sequence", "TRUE", "--baseline", "-1"),
+            "baseline_mm: expected a positive",
+        ),
+        (
+            ("BOARDS", "--board", "BOARD", "--sequence", "other.yaml"),
+            "expected 52 frames, found 22",
+        ),
         (("BOARDS", "--board", "BOARD", "--sequence", "ONE"), "codes vertical only"),
         (("NOWHERE", "--board", "BOARD", "--sequence", "TRUE"), "no such folder"),
-        (("BOARDS", "--board", "circles:5x9:0.05:0.015", "--sequence", "TRUE"), "--board, in mm, gives a baseline of"),
+        (
+            ("BOARDS", "--board", "circles:5x9:0.05:0.015", "--sequence", "TRUE"),
+            "--board, in mm, gives a baseline of",
+        ),
         (("--virtual", "boards", "--size", "20"), "--size 20: expected 64"),
-        (("--virtual", "boards", "--size", "240", "--board", "circles:5x9:500:150"), "does not fit"),
+        (
+            ("--virtual", "boards", "--size", "240", "--board", "circles:5x9:500:150"),
+            "does not fit",
+        ),
     ],
 )
-def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkeypatch, capsys, words, said):
+def test_bad_input_is_a_sentence_and_no_rig_is_written(
+    virtual, tmp_path, monkeypatch, capsys, words, said
+):
     monkeypatch.chdir(tmp_path)
     vertical = {"scheme": "phase-shift", "pitches_px": [48, 912], "steps": 3}
     one = {"projector": {"width": 912, "height": 1140}, "sequence": {"vertical": vertical}}
@@ -90,7 +139,9 @@ def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkey
         "NOWHERE": "nowhere",
         "ONE": "one.yaml",
     }
-    assert calibrate(*(places.get(word, word) for word in words), "--out", tmp_path / "rig.yaml") == 2
+    assert (
+        calibrate(*(places.get(word, word) for word in words), "--out", tmp_path / "rig.yaml") == 2
+    )
     error = capsys.readouterr().err
     assert said in error and "Traceback" not in error and not (tmp_path / "rig.yaml").exists()
 
@@ -108,7 +159,9 @@ CHANGED = {
         "pose_02: image 0 is that of pose_01 (image 0)",
     ),
     "mixed": (
-        lambda of, pose, name: np.roll(of(pose, name), 60 if pose == 1 and name in VERTICAL else 0, axis=1),
+        lambda of, pose, name: np.roll(
+            of(pose, name), 60 if pose == 1 and name in VERTICAL else 0, axis=1
+        ),
         "scene moved",
     ),
     "sizes": (
@@ -131,7 +184,14 @@ def test_changed_captures_are_refused(virtual, tmp_path, capsys, case):
         folder.mkdir(parents=True)
         for file in (virtual / "boards" / folder.name).glob("*.png"):
             cv2.imwrite(str(folder / file.name), change(photographed, pose, file.name))
-    words = ("--board", "circles:5x9:50:15", "--sequence", virtual / "true.yaml", "--out", tmp_path / "rig.yaml")
+    words = (
+        "--board",
+        "circles:5x9:50:15",
+        "--sequence",
+        virtual / "true.yaml",
+        "--out",
+        tmp_path / "rig.yaml",
+    )
     assert calibrate(tmp_path / "boards", *words) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "rig.yaml").exists()
 
@@ -150,7 +210,15 @@ def test_poses_that_are_refused_calibrate_anyway_and_are_named(virtual, tmp_path
     frames = [boards / "pose_03" / f"frame_{index:02d}.png" for index in (1, 2)]
     frames[1].write_bytes(frames[0].read_bytes())
     board = yaml.safe_load((boards / "board.yaml").read_text())["board"]
-    words = (boards, "--board", board, "--sequence", boards / "rig.yaml", "--out", tmp_path / "r.yaml")
+    words = (
+        boards,
+        "--board",
+        board,
+        "--sequence",
+        boards / "rig.yaml",
+        "--out",
+        tmp_path / "r.yaml",
+    )
     assert calibrate(*words, "--lens", "none") == 2
     assert "pose_03: equal frames: frame_01.png and frame_02.png" in capsys.readouterr().err
     assert calibrate(*words, "--lens", "none", "--anyway") == 0
@@ -161,10 +229,20 @@ def test_three_poses_leave_none_out_and_say_so(virtual, tmp_path, capsys):
     for pose in ("pose_00", "pose_01", "pose_02"):
         shutil.copytree(virtual / "boards" / pose, tmp_path / "boards" / pose)
     board = yaml.safe_load((virtual / "boards" / "board.yaml").read_text())["board"]
-    words = ("--board", board, "--sequence", virtual / "boards" / "rig.yaml", "--out", tmp_path / "rig.yaml")
+    words = (
+        "--board",
+        board,
+        "--sequence",
+        virtual / "boards" / "rig.yaml",
+        "--out",
+        tmp_path / "rig.yaml",
+    )
     assert calibrate(tmp_path / "boards", *words) == 0
     printed = capsys.readouterr()
-    assert "note: 3 poses: none can be left out" in printed.err and "the lens is radial-1. Capture four" in printed.err
+    assert (
+        "note: 3 poses: none can be left out" in printed.err
+        and "the lens is radial-1. Capture four" in printed.err
+    )
     assert "nan" not in printed.out + printed.err + (tmp_path / "rig.yaml").read_text()
 
 
@@ -176,11 +254,21 @@ def test_all_poses_without_a_board_are_named(virtual, tmp_path, capsys):
             image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
             cv2.imwrite(str(file), np.where(np.arange(SIZE) < SIZE // 2, 30, image))
     board = yaml.safe_load((boards / "board.yaml").read_text())["board"]
-    words = ("--board", board, "--sequence", boards / "rig.yaml", "--out", tmp_path / "rig.yaml", "--anyway")
+    words = (
+        "--board",
+        board,
+        "--sequence",
+        boards / "rig.yaml",
+        "--out",
+        tmp_path / "rig.yaml",
+        "--anyway",
+    )
     assert calibrate(boards, *words) == 2
     error = capsys.readouterr().err
     assert "2 poses can't be used" in error and "dots, in columns" in error
-    assert "pose_01: the board" in error and "pose_03: the board" in error and "pose_02" not in error
+    assert (
+        "pose_01: the board" in error and "pose_03: the board" in error and "pose_02" not in error
+    )
 
 
 def test_gray_code_alone_calibrates(tmp_path, capsys):
@@ -188,10 +276,25 @@ def test_gray_code_alone_calibrates(tmp_path, capsys):
     data = paper_rig(SIZE).to_dict()
     del data["pitch_px"]
     code = {"scheme": "gray", "cell_px": 2}
-    codes = {"order": ["vertical", "horizontal", "white", "black"], "vertical": code, "horizontal": dict(code)}
+    codes = {
+        "order": ["vertical", "horizontal", "white", "black"],
+        "vertical": code,
+        "horizontal": dict(code),
+    }
     (tmp_path / "true.yaml").write_text(yaml.safe_dump({**data, "sequence": codes}))
-    words = ("--true-rig", tmp_path / "true.yaml", "--poses", 4, "--lens", "none", "--out", tmp_path / "rig.yaml")
+    words = (
+        "--true-rig",
+        tmp_path / "true.yaml",
+        "--poses",
+        4,
+        "--lens",
+        "none",
+        "--out",
+        tmp_path / "rig.yaml",
+    )
     assert calibrate("--virtual", tmp_path / "boards", *words) == 0
     said = capsys.readouterr().out
     assert "response" not in said and "against truth" in said
-    assert load_rig(tmp_path / "rig.yaml").baseline_m == pytest.approx(paper_rig().baseline_m, rel=0.02)
+    assert load_rig(tmp_path / "rig.yaml").baseline_m == pytest.approx(
+        paper_rig().baseline_m, rel=0.02
+    )

@@ -1,4 +1,5 @@
-"""What a calibration says of itself: a sentence on what is improbable, and none where all is right."""
+"""What a calibration says of itself: a sentence on what is improbable, and none where all is
+right."""
 
 import re
 
@@ -22,7 +23,8 @@ def clean(points_mm=None, count=6):
 
 
 def shown(poses, change):
-    """The poses with projector coordinates (n, 2) that ``change`` makes of the number of the pose and its own."""
+    """The poses with projector coordinates (n, 2) that ``change`` makes of the number of the pose
+    and its own."""
     changed = []
     for number, pose in enumerate(poses):
         points = change(number, pose.projector.points_px)
@@ -62,12 +64,36 @@ def test_an_irregular_board_and_panels_of_oblong_pixels_are_not_doubted():
 @pytest.mark.parametrize(
     ("poses", "options", "said"),
     [
-        (shown(clean(), keystone(0.15, 0.25)), {}, r"warning: the projector's pixels seem skewed by .0\.\d+ px per px"),
-        (shown(clean(), keystone(-0.04, 0.06)), {}, r"warning: the projector's pixels seem skewed .* explains \d\d%"),
-        (shown(clean(), keystone(0.15, 0.2)), {"estimate_board": True}, "warning: the projector's pixels seem skewed"),
-        (shown(clean(), keystone(0, 0.3)), {}, r"note: the projector's fx / fy is 1\.\d+, expected 0.99\d+ to 1.0"),
-        (clean(BOARD.points_mm() * [1, 1.02, 1]), {}, r"columns seem farther apart than its rows by -(1\.9|2\.0)\d%"),
-        (clean(bent(1.5)), {}, r"warning: the board's ends seem bent by \+(2\.[01]|1\.9)\d% of half its side"),
+        (
+            shown(clean(), keystone(0.15, 0.25)),
+            {},
+            r"warning: the projector's pixels seem skewed by .0\.\d+ px per px",
+        ),
+        (
+            shown(clean(), keystone(-0.04, 0.06)),
+            {},
+            r"warning: the projector's pixels seem skewed .* explains \d\d%",
+        ),
+        (
+            shown(clean(), keystone(0.15, 0.2)),
+            {"estimate_board": True},
+            "warning: the projector's pixels seem skewed",
+        ),
+        (
+            shown(clean(), keystone(0, 0.3)),
+            {},
+            r"note: the projector's fx / fy is 1\.\d+, expected 0.99\d+ to 1.0",
+        ),
+        (
+            clean(BOARD.points_mm() * [1, 1.02, 1]),
+            {},
+            r"columns seem farther apart than its rows by -(1\.9|2\.0)\d%",
+        ),
+        (
+            clean(bent(1.5)),
+            {},
+            r"warning: the board's ends seem bent by \+(2\.[01]|1\.9)\d% of half its side",
+        ),
         (clean(bent(1.5)), {"estimate_board": True}, None),
         (
             shown(clean(), lambda i, p: p + 3.0 * (i > 2)),
@@ -105,10 +131,15 @@ def test_a_board_in_another_unit_is_named(factor, figures):
 
 
 def test_a_part_of_a_larger_image_is_named():
-    part = [pose._replace(size=(500, 600), corners_px=pose.corners_px - [500, 200]) for pose in clean()]
+    part = [
+        pose._replace(size=(500, 600), corners_px=pose.corners_px - [500, 200]) for pose in clean()
+    ]
     said = doubts(part, sizes=((500, 600), rigs.PROJECTOR_SIZE))
     assert len(said) == 1
-    assert re.match(r"note: the camera's principal point from the middle, in sides, is 0\.2\d*, expected 0 to", said[0])
+    assert re.match(
+        r"note: the camera's principal point from the middle, in sides, is 0\.2\d*, expected 0 to",
+        said[0],
+    )
 
 
 def test_a_lens_that_bends_too_much_is_named():

@@ -1,4 +1,5 @@
-"""The projector from phase and known depth, on surfaces whose phases OpenCV projects, with the projector hidden."""
+"""The projector from phase and known depth, on surfaces whose phases OpenCV projects, with the
+projector hidden."""
 
 from dataclasses import replace
 
@@ -27,16 +28,25 @@ def surface_mm(number=0):
 def periods_of(depth_mm, focal=(1700.0, 1700.0), centre=(455.5, 569.5), pitch=(24.0, 20.0), k1=0.0):
     """Absolute phase / 2 pi at each camera pixel, by direction, with OpenCV's projection."""
     x, y = KNOWN.camera.rays()
-    points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 1, 3) * depth_mm.reshape(-1, 1, 1) / 1000
+    points = (
+        np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 1, 3)
+        * depth_mm.reshape(-1, 1, 1)
+        / 1000
+    )
     matrix = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1.0]])
-    pixels = cv2.projectPoints(points, TURN, SHIFT_M, matrix, np.array([k1, 0, 0, 0.0]))[0].reshape(*depth_mm.shape, 2)
+    pixels = cv2.projectPoints(points, TURN, SHIFT_M, matrix, np.array([k1, 0, 0, 0.0]))[0].reshape(
+        *depth_mm.shape, 2
+    )
     return {"vertical": pixels[..., 0] / pitch[0], "horizontal": pixels[..., 1] / pitch[1]}
 
 
 def view(number=0, noise=0.0, depth_mm=None, **projector):
     depth_mm = surface_mm(number) if depth_mm is None else depth_mm
     rng = np.random.default_rng(number)
-    periods = {name: w + noise * rng.standard_normal(w.shape) for name, w in periods_of(depth_mm, **projector).items()}
+    periods = {
+        name: w + noise * rng.standard_normal(w.shape)
+        for name, w in periods_of(depth_mm, **projector).items()
+    }
     return view_from_maps(f"view {number}", KNOWN.camera, periods, depth_mm)
 
 
@@ -63,13 +73,18 @@ def test_noise_and_wrong_pixels_leave_the_pitch_and_the_standard_errors_honest()
     rig, fit = fit_projector(views, KNOWN)
     assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (24, 20)
     assert np.abs(np.subtract(fit.pitch_px, (24, 20))).max() < 0.05
-    assert all(abs(p - true) < 5 * e for p, true, e in zip(fit.pitch_px, (24, 20), fit.pitch_error_px, strict=True))
+    assert all(
+        abs(p - true) < 5 * e
+        for p, true, e in zip(fit.pitch_px, (24, 20), fit.pitch_error_px, strict=True)
+    )
     assert [residual.name for residual in fit.views] == [f"view {number}" for number in range(4)]
     assert abs(fit.total.median_mm) < 0.1
 
 
 @pytest.mark.parametrize(
-    ("pitch", "words"), [((912 / 50, 1140 / 50), "912 px / 50"), ((17.93, 21.37), "middle")], ids=["part", "no whole"]
+    ("pitch", "words"),
+    [((912 / 50, 1140 / 50), "912 px / 50"), ((17.93, 21.37), "middle")],
+    ids=["part", "no whole"],
 )
 def test_a_pitch_that_is_no_whole_number_stays_what_it_is(pitch, words):
     rig, fit = fit_projector([view(pitch=pitch)], KNOWN)
@@ -135,7 +150,16 @@ def scrambled():
         ([view(depth_mm=np.where(X < -0.95, surface_mm(), 0))], "at least 200 pixels"),
         ([view(centre=(-200.0, 569.5))], "outside the pattern"),
     ],
-    ids=["tilted", "noisy flat", "mirrored u", "mirrored v", "scrambled", "none", "few", "centre outside"],
+    ids=[
+        "tilted",
+        "noisy flat",
+        "mirrored u",
+        "mirrored v",
+        "scrambled",
+        "none",
+        "few",
+        "centre outside",
+    ],
 )
 def test_what_does_not_determine_a_projector_is_refused(views, message):
     with pytest.raises(CalibrationError, match=message):
@@ -152,7 +176,10 @@ def test_shallow_relief_is_enough_or_refused_by_its_noise():
 
 
 def test_flat_boards_at_several_places_determine_it():
-    views = [view(n, depth_mm=flat(tilt) + shift) for n, (tilt, shift) in enumerate([(0, 0), (0.6, 100), (-0.5, 200)])]
+    views = [
+        view(n, depth_mm=flat(tilt) + shift)
+        for n, (tilt, shift) in enumerate([(0, 0), (0.6, 100), (-0.5, 200)])
+    ]
     rig, fit = fit_projector(views, KNOWN)
     assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (24, 20)
     assert fit.total.rms_mm < 1e-4
@@ -164,7 +191,9 @@ def test_maps_that_do_not_fit_are_refused():
     with pytest.raises(CalibrationError, match="expected depth of shape"):
         view_from_maps("v", camera, periods, depth_mm[1:])
     with pytest.raises(CalibrationError, match="expected horizontal phase of shape"):
-        view_from_maps("v", camera, {**periods, "horizontal": periods["horizontal"][:, 1:]}, depth_mm)
+        view_from_maps(
+            "v", camera, {**periods, "horizontal": periods["horizontal"][:, 1:]}, depth_mm
+        )
     with pytest.raises(CalibrationError, match="no phase of the horizontal fringes"):
         view_from_maps("v", camera, {"vertical": periods["vertical"]}, depth_mm)
     with pytest.raises(CalibrationError, match="NaN"):
@@ -188,8 +217,12 @@ def test_pixels_without_phase_are_left_out():
 def test_frames_give_periods_without_their_pitch(vertical, horizontal):
     """Patterns looked at directly: the camera sees projector pixels 1:1."""
     camera = Pinhole(912, 1140, 1824.0, 1824.0, 455.5, 569.5)
-    shown = replace(paper_rig(), camera=camera, pitch_vertical_px=vertical, pitch_horizontal_px=horizontal)
-    frames = [np.ascontiguousarray(pattern_image(shown, index)) for index in range(len(shown.sequence))]
+    shown = replace(
+        paper_rig(), camera=camera, pitch_vertical_px=vertical, pitch_horizontal_px=horizontal
+    )
+    frames = [
+        np.ascontiguousarray(pattern_image(shown, index)) for index in range(len(shown.sequence))
+    ]
     ignorant = replace(shown, pitch_vertical_px=30.0, pitch_horizontal_px=30.0)
     measured = view_from_frames("v", frames, np.full((1140, 912), 1800.0), ignorant)
     assert isinstance(measured, DepthView)

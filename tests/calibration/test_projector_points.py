@@ -8,7 +8,9 @@ from fpp_ml_bench.calibration.projector_points import measure_pose, projector_po
 from fpp_ml_bench.errors import CalibrationError
 
 TO_PROJECTOR = np.array([[1.3, 0.1, 40.0], [-0.05, 1.2, 60.0], [4e-4, -3e-4, 1.0]])
-CORNERS = np.stack(np.meshgrid(30.3 + 21 * np.arange(6), 25.7 + 20 * np.arange(5)), -1).reshape(-1, 2)
+CORNERS = np.stack(np.meshgrid(30.3 + 21 * np.arange(6), 25.7 + 20 * np.arange(5)), -1).reshape(
+    -1, 2
+)
 SHAPE = (130, 160)
 
 
@@ -66,6 +68,9 @@ def test_points_without_enough_pixels_say_why():
 
 
 def test_other_sizes_are_refused():
-    with pytest.raises(CalibrationError, match=r"pose a: the image is 160 x 130 px, but the map of projector rows 160"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"pose a: the image is 160 x 130 px, but the map of projector rows 160",
+    ):
         board = parse_board("checker:6x5:10")
         measure_pose("a", np.zeros(SHAPE, np.uint8), np.zeros(SHAPE), np.zeros((131, 160)), board)

@@ -1,4 +1,5 @@
-"""The response of projector and camera from photographed boards, against the light that photographed."""
+"""The response of projector and camera from photographed boards, against the light that
+photographed."""
 
 import pytest
 
@@ -20,7 +21,9 @@ def test_gamma_is_that_of_the_light(tmp_path, gamma):
         "vertical": {"scheme": "phase-shift", "pitches_px": [24, 912], "steps": [4, 8]},
         "horizontal": {"scheme": "phase-shift", "pitches_px": [24, 1140], "steps": [4, 8]},
     }
-    rig = rig_from_dict({**data, "sequence": {"order": ["vertical", "horizontal", "white"], **codes}})
+    rig = rig_from_dict(
+        {**data, "sequence": {"order": ["vertical", "horizontal", "white"], **codes}}
+    )
     board = fitting_board(rig)
     light = named_light("paper").changed("projector", response=gamma)
     photograph_board(tmp_path / "boards", rig, board, poses_of(rig, board, 3), light)

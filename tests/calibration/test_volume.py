@@ -1,4 +1,5 @@
-"""The depth error of a rig over another's range, against closed forms, and of rigs found from photographed boards."""
+"""The depth error of a rig over another's range, against closed forms, and of rigs found from
+photographed boards."""
 
 from dataclasses import replace
 
@@ -37,7 +38,9 @@ def test_a_shifted_principal_point_of_one_direction_shifts_inverse_depth():
     """u_p = f (x + b / Z) + c: c + 1 px seen as c gives 1 / Z + 1 / (f b)."""
     content = RIG.to_dict()
     del content["pitch_px"]
-    content["sequence"] = {"vertical": {"scheme": "phase-shift", "pitches_px": [18, 912], "steps": 3}}
+    content["sequence"] = {
+        "vertical": {"scheme": "phase-shift", "pitches_px": [18, 912], "steps": 3}
+    }
     true = rig_from_dict(content)
     assert isinstance(true.sequence, CodedSequence)
     other = replace(true, projector=replace(true.projector, cx=true.projector.cx - 1))
@@ -68,12 +71,19 @@ def captured(tmp_path_factory):
 
 @pytest.mark.parametrize("spacing_given", [1.0, 0.95])
 def test_a_photographed_board_gives_the_rig_back_and_a_wrong_spacing_shows(captured, spacing_given):
-    """The trap of a printed board whose spacing is not the one that was asked for: no reprojection error shows it."""
+    """The trap of a printed board whose spacing is not the one that was asked for: no reprojection
+    error shows it."""
     true, board, poses = captured
-    given = replace(board, spacing_mm=spacing_given * board.spacing_mm, detail_mm=spacing_given * board.detail_mm)
+    given = replace(
+        board,
+        spacing_mm=spacing_given * board.spacing_mm,
+        detail_mm=spacing_given * board.detail_mm,
+    )
     sizes = ((device.width, device.height) for device in (true.camera, true.projector))
     found = calibrate(poses, given, *sizes, (Lens("none"), Lens("none")), hold_out=False)
-    assert found.rms_px.camera < 0.05 and found.rms_px.projector < 0.1  # an image px is 2.6 projector px
+    assert (
+        found.rms_px.camera < 0.05 and found.rms_px.projector < 0.1
+    )  # an image px is 2.6 projector px
     rig = replace(
         true,
         camera=found.camera.pinhole,

@@ -24,7 +24,19 @@ from fpp_ml_bench.optics.rig_file import save_rig
 from fpp_ml_bench.optics.sequence import Sequence
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAVY = ("numpy", "torch", "datasets", "pyarrow", "scipy", "cv2", "numba", "matplotlib", "pydantic", "yaml", "trimesh")
+HEAVY = (
+    "numpy",
+    "torch",
+    "datasets",
+    "pyarrow",
+    "scipy",
+    "cv2",
+    "numba",
+    "matplotlib",
+    "pydantic",
+    "yaml",
+    "trimesh",
+)
 
 
 def call(*arguments, command=main):
@@ -39,7 +51,8 @@ def call(*arguments, command=main):
 
 
 AT_ONCE = "", "fpp-eval"
-"""Help that no heavy import precedes. That of a command may import what the command needs at once, but no torch."""
+"""Help that no heavy import precedes. That of a command may import what the command needs at once,
+but no torch."""
 HELPS = """
 import json, sys
 from contextlib import redirect_stdout
@@ -53,7 +66,8 @@ for name in sys.argv[1:]:
     print(json.dumps([name, status, text.getvalue(), sorted(set(sys.modules) - loaded)]))
     loaded = set(sys.modules)
 """
-"""Prints the help of each name, one after the other in one process, and the modules that it was the first to import."""
+"""Prints the help of each name, one after the other in one process, and the modules that it was the
+first to import."""
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +82,9 @@ def helps():
 @pytest.mark.parametrize("name", [*AT_ONCE, *COMMANDS])
 def test_help_answers_without_importing_anything_heavy(helps, name):
     status, text, imported = helps[name]
-    assert status == 0 and not set(imported) & (set(HEAVY) if name in AT_ONCE else {"torch", "datasets"})
+    assert status == 0 and not set(imported) & (
+        set(HEAVY) if name in AT_ONCE else {"torch", "datasets"}
+    )
     assert "usage:" in text and "examples:" in text
     if name not in AT_ONCE:
         assert f"usage: fpp-bench {name}" in text
@@ -77,7 +93,11 @@ def test_help_answers_without_importing_anything_heavy(helps, name):
 
 @pytest.mark.processes
 def test_help_of_the_program_imports_no_command(helps):
-    imported = {name.removeprefix("fpp_ml_bench.") for name in helps[""][2] if name.startswith("fpp_ml_bench.")}
+    imported = {
+        name.removeprefix("fpp_ml_bench.")
+        for name in helps[""][2]
+        if name.startswith("fpp_ml_bench.")
+    }
     assert imported <= {"cli", "cli.options", "errors", "files", "machine", "options"}
 
 
@@ -94,7 +114,10 @@ def test_every_command_of_the_tables_is_grouped_and_says_what_it_does():
         for name in program.commands:
             command = program.command(name)
             if isinstance(command, Program):
-                assert all(command.command(inner).help for inner in command.commands) and command.purpose
+                assert (
+                    all(command.command(inner).help for inner in command.commands)
+                    and command.purpose
+                )
             else:
                 assert command.help and command.examples
 
@@ -112,7 +135,9 @@ def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatc
             lines = [line for line in command.examples.splitlines() if line.startswith("fpp-")]
             assert lines, name
             for line in lines:
-                first, *words = shlex.split(line.split("   ")[0].split(" && ")[0].split(" | ")[0].split(" > ")[0])
+                first, *words = shlex.split(
+                    line.split("   ")[0].split(" && ")[0].split(" | ")[0].split(" > ")[0]
+                )
                 other = {"fpp-bench": BENCH, "fpp-eval": EVAL}[first]
                 default = other.default and words[0] not in other.commands
                 target = other.command(other.default if default else words[0])
@@ -153,7 +178,10 @@ def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatc
         (["show", "TINY", "mug_A0", "--out", "x.jpg"], "ending in .png"),
         (["show", "TINY", "mug_A0", "--out", "FILE/x.png"], "can't be written"),
         (["show", "TINY", "--sheet", "--split", "val", "--out", "x.png"], "no split 'val'"),
-        (["show", "TINY", "--sheet", "--views", "0", "--out", "x.png"], "--views 0: expected 1 or more"),
+        (
+            ["show", "TINY", "--sheet", "--views", "0", "--out", "x.png"],
+            "--views 0: expected 1 or more",
+        ),
         (["show", "TINY", "--sheet", "--cloud", "--out", "x.png"], "--cloud: expected a SAMPLE"),
         (["predict", "magic", "TINY", "--out", "OUT"], "there are classical"),
         (["predict", "classical", "TINY", "--out", "OUT", "--steps", "2"], "3 to the 18"),
@@ -165,11 +193,14 @@ def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatc
         (["train", "phase-net", "TINY", "--out", "OUT"], "renders what it learns from"),
         (
             ["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"],
-            "--rate is an option of classical-net, phase-net, crossed-net, fringe-net, not of loss/l1",
+            "--rate is an option of classical-net, phase-net, crossed-net, fringe-net, not of "
+            "loss/l1",
         ),
     ],
 )
-def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monkeypatch, capsys, arguments, message):
+def test_bad_input_exits_2_with_a_message_and_makes_nothing(
+    tiny, tmp_path, monkeypatch, capsys, arguments, message
+):
     monkeypatch.chdir(tmp_path)
     for name in ("FILE", "FILE.txt"):
         Path(name).write_text("x")
@@ -184,7 +215,10 @@ def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monk
     ("error", "message"),
     [
         (PermissionError(13, "Permission denied", "/somewhere"), "/somewhere: Permission denied"),
-        (OSError(28, "No space left on device"), "standard output or a temporary file: No space left on device"),
+        (
+            OSError(28, "No space left on device"),
+            "standard output or a temporary file: No space left on device",
+        ),
         (OSError("the stream ended"), "the stream ended"),
     ],
 )
@@ -215,24 +249,31 @@ def test_ctrl_c_is_130(tiny, monkeypatch, capsys):
 def test_info_json_says_what_is_there(tiny, opened, capsys):
     assert call("info", tiny, "--json", "-") == 0
     content = json.loads(capsys.readouterr().out)
-    assert content["fingerprint"] == opened.fingerprint and content["size"] == [TINY_SIZE, TINY_SIZE]
+    assert content["fingerprint"] == opened.fingerprint and content["size"] == [
+        TINY_SIZE,
+        TINY_SIZE,
+    ]
     assert content["samples"] == opened.splits
-    on_disk = sum(p.stat().st_size for p in tiny.rglob("*") if p.is_file() and p.name != "manifest.json")
+    on_disk = sum(
+        p.stat().st_size for p in tiny.rglob("*") if p.is_file() and p.name != "manifest.json"
+    )
     assert content["bytes"] == on_disk
     assert content["rig"]["sequence"]["steps"] == 18
     for split in content["splits"]:
         names = opened.splits[split["split"]]
         errors, covers = [], []
         for sample in names:
-            depth, exact = (opened.depth_mm(sample, c).astype(np.float64) for c in ("depth", "depth_exact"))
+            depth, exact = (
+                opened.depth_mm(sample, c).astype(np.float64) for c in ("depth", "depth_exact")
+            )
             decoded = (depth > 0) & (exact > 0) & ((opened.flags(sample) & VOID) == 0)
             errors.append(np.abs(depth - exact)[decoded].mean())
             covers.append((depth > 0).mean())
         assert split["samples"] == len(names)
         assert split["gt_mae_mm"] == pytest.approx(np.mean(errors), rel=1e-9)
         assert split["cover_mean"] == pytest.approx(np.mean(covers), rel=1e-9)
-        # Void pixels, most of them at edges, count in neither: the drill has 0.48 mm, and in its interior, with more
-        # bounced light, 0.50 mm.
+        # Void pixels, most of them at edges, count in neither: the drill has 0.48 mm, and in its
+        # interior, with more bounced light, 0.50 mm.
         assert 0 < split["gt_mae_mm"] < 0.5
         assert 0 < split["gt_interior_mae_mm"] < 0.6
 
@@ -261,12 +302,18 @@ def test_show_writes_a_picture_of_the_sample(tiny, tmp_path):
     assert width > 1000 and height > 500
     colour = picture.max(axis=2).astype(int) - picture.min(axis=2)
     assert (colour > 40).mean() > 0.01  # depth maps are in colour
-    assert ((colour < 3) & (picture[..., 0] > 20) & (picture[..., 0] < 235)).mean() > 0.05  # frames are grey
+    assert (
+        (colour < 3) & (picture[..., 0] > 20) & (picture[..., 0] < 235)
+    ).mean() > 0.05  # frames are grey
 
 
 def test_show_draws_fewer_views_larger_or_more_objects_in_a_line(tiny, tmp_path):
     """Of the four objects; six views make two lines of two."""
-    for views, size in ((1, (258, 4 * 248 - 8)), (2, (138, 4 * 248 - 8)), (99, (2 * 138, 2 * 728 - 8))):
+    for views, size in (
+        (1, (258, 4 * 248 - 8)),
+        (2, (138, 4 * 248 - 8)),
+        (99, (2 * 138, 2 * 728 - 8)),
+    ):
         assert call("show", tiny, "--sheet", "--views", views, "--out", tmp_path / "x.png") == 0
         assert cv2.imread(str(tmp_path / "x.png"), cv2.IMREAD_GRAYSCALE).shape == size
 
@@ -285,13 +332,17 @@ def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypa
     assert [p.name for p in tmp_path.iterdir()] == ["cork_A0.png"]
 
 
-def test_show_reads_predictions_in_the_units_that_they_declare_and_below_0_there_is_nothing(tiny, tmp_path):
+def test_show_reads_predictions_in_the_units_that_they_declare_and_below_0_there_is_nothing(
+    tiny, tmp_path
+):
     dataset, clouds = DatasetFolder(tiny), []
     for units, per_mm in (("mm", 1), ("m", 0.001)):
         folder = write_predictions(tmp_path / units, dataset, units=units)
         for path in folder.glob("*.npy"):
             depth = np.load(path)
-            np.save(path, np.where(depth > 0, depth * np.float32(per_mm), np.float32(-0.01)))  # as networks put out
+            np.save(
+                path, np.where(depth > 0, depth * np.float32(per_mm), np.float32(-0.01))
+            )  # as networks put out
         words = "show", tiny, "power_drill_A60", "--predictions", folder, "--cloud"
         assert call(*words, "--out", tmp_path / f"{units}.png") == 0
         clouds.append(trimesh.load(tmp_path / f"{units}.ply").vertices)
@@ -308,7 +359,12 @@ def test_show_refuses_predictions_that_could_not_be_scored(tiny, tmp_path, capsy
 
 
 def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_path):
-    coarse = replace(paper_rig(TINY_SIZE), pitch_horizontal_px=1140, pitch_vertical_px=912, sequence=Sequence(3, 1, 1))
+    coarse = replace(
+        paper_rig(TINY_SIZE),
+        pitch_horizontal_px=1140,
+        pitch_vertical_px=912,
+        sequence=Sequence(3, 1, 1),
+    )
     save_rig(coarse, tmp_path / "rig.yaml")
     for name, options in (
         ("one", ("--size", TINY_SIZE, "--config", "single_shot")),
@@ -329,7 +385,12 @@ def test_contact_sheet_shows_every_object_and_view(tiny, opened, tmp_path):
     assert sheet.shape == (2 * (tile + label), 2 * 6 * tile + 8)
     for number, name in enumerate(("bowl", "cork", "mug", "power_drill")):
         for view_number, view in enumerate(VIEWS):
-            y, x = (number // 2) * (tile + label) + label, (number % 2) * (6 * tile + 8) + view_number * tile
+            y, x = (
+                (number // 2) * (tile + label) + label,
+                (number % 2) * (6 * tile + 8) + view_number * tile,
+            )
             shown = sheet[y : y + tile, x : x + tile].astype(float)
-            frame = cv2.resize(opened.frame(f"{name}_{view}", 51), (tile, tile), interpolation=cv2.INTER_AREA)
+            frame = cv2.resize(
+                opened.frame(f"{name}_{view}", 51), (tile, tile), interpolation=cv2.INTER_AREA
+            )
             assert np.corrcoef(shown.ravel(), frame.astype(float).ravel())[0, 1] > 0.99

@@ -1,5 +1,5 @@
-"""Long work under faults: two at once, a broken cache of machine code, full disks, files that are cut while they are
-read, outputs that nobody reads, and SIGTERM."""
+"""Long work under faults: two at once, a broken cache of machine code, full disks, files that are
+cut while they are read, outputs that nobody reads, and SIGTERM."""
 
 import errno
 import os
@@ -29,7 +29,15 @@ from fpp_ml_bench.cli import main, main_eval, run_command
 from fpp_ml_bench.cli.console import progress_bar
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import BuildError, DatasetError, PoolError, RemoteError, TrainingError
-from fpp_ml_bench.files import LOCK_FILE, exclusive, file_hash, printable, whole_file, whole_folder, write_atomically
+from fpp_ml_bench.files import (
+    LOCK_FILE,
+    exclusive,
+    file_hash,
+    printable,
+    whole_file,
+    whole_folder,
+    write_atomically,
+)
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.storage import assembly
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -51,19 +59,27 @@ def test_of_two_that_predict_into_a_folder_one_is_told(tiny, tmp_path, capsys):
     out = tmp_path / "out"
     with exclusive(out / LOCK_FILE, out, "here"):
         assert predict(tiny, out) == 2
-    assert f"{out}: another process is predicting into this folder; wait for it or" in capsys.readouterr().err
+    assert (
+        f"{out}: another process is predicting into this folder; wait for it or"
+        in capsys.readouterr().err
+    )
     assert predict(tiny, out) == 0
     assert not (out / LOCK_FILE).exists() and main_eval(["check", str(out)]) == 0
 
 
-def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(tiny, tmp_path, capsys):
+def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
+    tiny, tmp_path, capsys
+):
     out = tmp_path / "out"
     out.mkdir()
     for name in (LOCK_FILE, ".power_drill_A0.npy.123.tmp", "unfinished.jsonl"):
         (out / name).write_text("")
     main_eval([str(out), str(tiny)])
     problems = capsys.readouterr().err
-    assert "unfinished.jsonl: is extra (a stopped fpp-bench predict left it: run the same command again" in problems
+    assert (
+        "unfinished.jsonl: is extra (a stopped fpp-bench predict left it: run the same command "
+        "again" in problems
+    )
     assert LOCK_FILE not in problems
     assert predict(tiny, out) == 0
     assert main_eval([str(out), str(tiny)]) == 0
@@ -71,7 +87,12 @@ def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
 
 def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
     out = tmp_path / "run"
-    with alone_in(out), pytest.raises(TrainingError, match="another process is training in this folder; wait for it"):
+    with (
+        alone_in(out),
+        pytest.raises(
+            TrainingError, match="another process is training in this folder; wait for it"
+        ),
+    ):
         train_net(PhaseRecipe(), out)
     assert not out.exists()  # the lock made it, and nothing was written there
 
@@ -146,7 +167,9 @@ def test_a_full_or_unusable_cache_folder_is_gone_without(tmp_path):
     (tmp_path / "file").write_text("")
     use = "import kernel, numpy as np\nprint(kernel.total(np.arange(3.0)))"
     assert _python(use, tmp_path, NUMBA_CACHE_DIR="file").stdout == "5.0\n"
-    limited = f"import resource, signal\nresource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n{use}"
+    limited = (
+        f"import resource, signal\nresource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n{use}"
+    )
     assert _python(limited, tmp_path, NUMBA_CACHE_DIR="code").stdout == "5.0\n"
     assert not list((tmp_path / "code").rglob("*.nbc"))
 
@@ -180,7 +203,17 @@ def test_full_disks_are_answered_with_file_and_cure(tiny, tmp_path, capsys):
     predictions, again, rig = tmp_path / "predictions", tmp_path / "again", tmp_path / "rig.yaml"
     assert predict(tiny, predictions) == 0
     score = [str(predictions), str(tiny), "--json", str(tmp_path / "result.json")]
-    board = ["calibrate", "--virtual", str(tmp_path / "v"), "--size", "256", "--poses", "4", "--out", str(rig)]
+    board = [
+        "calibrate",
+        "--virtual",
+        str(tmp_path / "v"),
+        "--size",
+        "256",
+        "--poses",
+        "4",
+        "--out",
+        str(rig),
+    ]
     words = ["predict", "constant", str(tiny), "--out", str(again)]
     for run, arguments, count, name in (
         (main, words, 100, "again/unfinished.jsonl"),
@@ -223,7 +256,8 @@ def test_errors_of_the_system_come_without_numbers(tmp_path, monkeypatch):
 
     monkeypatch.setattr(assembly, "_check_settings", full)
     with pytest.raises(
-        DatasetError, match=r"^/some/file: writing failed \(No space left on device\); remove the cause"
+        DatasetError,
+        match=r"^/some/file: writing failed \(No space left on device\); remove the cause",
     ):
         build(tmp_path / "set", tiny_settings(), workers=1)
 
@@ -237,9 +271,13 @@ def test_a_shard_that_is_cut_while_it_is_open_is_named(tmp_path):
     opened.frame(sample, 0)
     shard = next(shard for shard in opened.manifest.shards if shard.split == "test")
     os.truncate(opened.path / shard.path, 4096)
-    with pytest.raises(DatasetError, match=rf"{shard.path}: was cut to 4096 bytes while it was read"):
+    with pytest.raises(
+        DatasetError, match=rf"{shard.path}: was cut to 4096 bytes while it was read"
+    ):
         opened.depth_mm(sample)
-    with pytest.raises(DatasetError, match=rf"{shard.path}: has 4096 bytes, expected {shard.bytes}"):
+    with pytest.raises(
+        DatasetError, match=rf"{shard.path}: has 4096 bytes, expected {shard.bytes}"
+    ):
         DatasetFolder(opened.path)
 
 
@@ -291,7 +329,10 @@ def test_a_folder_that_is_made_whole_does_not_begin_in_a_link(tmp_path):
     (tmp_path / "elsewhere" / "files").mkdir(parents=True)
     (tmp_path / "elsewhere" / "files" / "kept").write_text("")
     (tmp_path / ".out.unfinished").symlink_to("elsewhere")
-    with pytest.raises(BuildError, match="is a link"), whole_folder(tmp_path / "out", "here", BuildError):
+    with (
+        pytest.raises(BuildError, match="is a link"),
+        whole_folder(tmp_path / "out", "here", BuildError),
+    ):
         pass
     assert (tmp_path / "elsewhere" / "files" / "kept").exists()
 
@@ -308,7 +349,10 @@ def test_too_little_memory_is_a_message(capsys):
         run_command(Mock(side_effect=ImportError("cannot import name 'x'")), "fpp-bench x", [])
     said = capsys.readouterr().err
     assert "a library can't be loaded (libarrow.so: failed" in said
-    assert "there is not enough memory;" in said and "memory (Unable to allocate 3 GiB); allow more" in said
+    assert (
+        "there is not enough memory;" in said
+        and "memory (Unable to allocate 3 GiB); allow more" in said
+    )
 
 
 def test_what_would_steer_the_terminal_is_escaped_in_an_error(capsys, tmp_path):
@@ -335,7 +379,9 @@ def test_without_shared_memory_there_is_a_message(monkeypatch):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     monkeypatch.setattr(pool, "ProcessPoolExecutor", read_only)
-    message = r"shared memory \(/dev/shm\) can't be used \(Read-only file system\).* or give --workers 1"
+    message = (
+        r"shared memory \(/dev/shm\) can't be used \(Read-only file system\).* or give --workers 1"
+    )
     with pytest.raises(PoolError, match=message), pool.mapping(None, 2):
         pass
 
@@ -404,7 +450,10 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(capsys, tmp_path):
 
 @pytest.mark.processes
 def test_sigterm_during_an_import_is_not_swallowed(tmp_path):
-    swallows = "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGTERM)\nexcept BaseException:\n    pass\n"
+    swallows = (
+        "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGTERM)\nexcept "
+        "BaseException:\n    pass\n"
+    )
     (tmp_path / "swallows.py").write_text(swallows)
     code = (
         "from fpp_ml_bench.cli import run_command\n"
@@ -433,6 +482,10 @@ def test_a_prediction_that_is_terminated_resumes(tiny, tmp_path):
         and errors.endswith("fpp-bench predict: stopped; the same command continues\n")
         and "Traceback" not in errors
     )
-    assert (out / "unfinished.jsonl").exists() and not (out / LOCK_FILE).exists() and not list(out.glob(".*.tmp"))
+    assert (
+        (out / "unfinished.jsonl").exists()
+        and not (out / LOCK_FILE).exists()
+        and not list(out.glob(".*.tmp"))
+    )
     assert main(words) == 0
     assert np.load(next(out.glob("*.npy"))).shape == (TINY_SIZE, TINY_SIZE)

@@ -1,4 +1,5 @@
-"""What a newcomer meets first: ``fpp-bench demo``, and every command and block of code in README."""
+"""What a newcomer meets first: ``fpp-bench demo``, and every command and block of code in
+README."""
 
 import json
 import re
@@ -32,8 +33,8 @@ def small():
 
 @pytest.fixture(scope="module")
 def demo(small, tmp_path_factory):
-    """A demo that was stopped while its last method predicted, and then run again: its folder, a result of before the
-    second run, and what that run printed on standard output and error."""
+    """A demo that was stopped while its last method predicted, and then run again: its folder, a
+    result of before the second run, and what that run printed on standard output and error."""
     folder = tmp_path_factory.mktemp("demo") / "demo"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fpp_ml_bench.cli.predict.predict_split", _stopped_at_crossed(folder))
@@ -75,14 +76,19 @@ def published_hub(tmp_path_factory, monkeypatch):
 
 def test_a_stopped_demo_goes_on_and_prints_what_was_computed(demo):
     out, earlier, printed, steps = demo
-    assert (out / "phase.json").read_bytes() == earlier and "kept: fpp-bench reliance phase" in steps
+    assert (
+        out / "phase.json"
+    ).read_bytes() == earlier and "kept: fpp-bench reliance phase" in steps
     for method in METHODS:
         result = json.loads((out / f"{method}.json").read_text())
         frames = len(result["submission"]["frames_used"])
         errors = [f"{result['metrics'][key]:.2f}" for key in ("object_mae_mm", "overall_mae_mm")]
         (line,) = [line for line in printed.splitlines() if line.startswith(f"│ {method} ")]
         cells = [cell.strip() for cell in line.split("│")[1:-1]]
-        assert cells[:4] == [method, str(frames), *errors] and cells[5] == f"{result['reliance']['score']:.2f}"
+        assert (
+            cells[:4] == [method, str(frames), *errors]
+            and cells[5] == f"{result['reliance']['score']:.2f}"
+        )
     for name in ("page/index.html", f"{SAMPLE}.png", f"{SAMPLE}.ply", f"{SAMPLE}.html"):
         assert (out / name).stat().st_size > 0
     commands = [line.strip() for line in printed.splitlines() if line.startswith("  fpp-")]
@@ -92,7 +98,14 @@ def test_a_stopped_demo_goes_on_and_prints_what_was_computed(demo):
 
 
 def test_predictions_are_shown_beside_the_frames_that_they_were_made_of(out, tmp_path, capsys):
-    show = ["show", str(out / "mini"), SAMPLE, "--out", str(tmp_path / "shown.png"), "--predictions"]
+    show = [
+        "show",
+        str(out / "mini"),
+        SAMPLE,
+        "--out",
+        str(tmp_path / "shown.png"),
+        "--predictions",
+    ]
     assert main([*show, str(out / "phase")]) == 0 and main([*show, str(out / "crossed")]) == 2
     assert "test/frame_00 is another now; give the dataset" in capsys.readouterr().err
     assert main(["show", str(out / "mini"), "--sheet", "--predictions", str(out / "phase")]) == 2
@@ -112,10 +125,16 @@ def test_a_command_that_fails_stops_the_demo(tmp_path, capsys):
 
 
 def captures_in(folder):
-    """What README's lines on an own rig start from: a sequence, poses of a board, a capture, captures of an object."""
+    """What README's lines on an own rig start from: a sequence, poses of a board, a capture,
+    captures of an object."""
     sequence = {"steps": 3, "bits_horizontal": 7, "bits_vertical": 7}
-    (folder / "true.yaml").write_text(yaml.safe_dump({**paper_rig(240).to_dict(), "sequence": sequence}))
-    run("fpp-bench calibrate --virtual poses --true-rig true.yaml --poses 5 --lens none --out found.yaml")
+    (folder / "true.yaml").write_text(
+        yaml.safe_dump({**paper_rig(240).to_dict(), "sequence": sequence})
+    )
+    run(
+        "fpp-bench calibrate --virtual poses --true-rig true.yaml --poses 5 --lens none --out "
+        "found.yaml"
+    )
     (folder / "poses" / "rig.yaml").rename(folder / "projector.yaml")
     run("fpp-bench build --out lab --rig true.yaml --objects power_drill --workers 1")
     lab = DatasetFolder(folder / "lab")
@@ -131,7 +150,9 @@ def test_every_command_and_block_of_readme_runs(out, published_hub, tmp_path, mo
     Path("demo").symlink_to(out)
     captures_in(tmp_path)
     monkeypatch.setitem(PRESETS, "mini", (("mug", "cork", "power_drill"), 256))
-    blocks = re.findall(r"^```(bash|python)\n(.*?)^```$", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
+    blocks = re.findall(
+        r"^```(bash|python)\n(.*?)^```$", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE
+    )
     ran = []
     for language, text in blocks:
         if text.startswith("# mine.py"):
@@ -143,5 +164,7 @@ def test_every_command_and_block_of_readme_runs(out, published_hub, tmp_path, mo
                 run(line)
                 ran.append(line)
     assert len(blocks) - 2 >= 9 and len(ran) >= 12
-    assert {"mine.png", "mine.html", "result.json", "rig.yaml"} <= {path.name for path in tmp_path.iterdir()}
+    assert {"mine.png", "mine.html", "result.json", "rig.yaml"} <= {
+        path.name for path in tmp_path.iterdir()
+    }
     assert list(DatasetFolder("data/own").splits) and list(DatasetFolder("data/published").splits)

@@ -1,4 +1,5 @@
-"""Commands made of functions and dataclasses: what the command line gives, what it refuses, and methods of a user."""
+"""Commands made of functions and dataclasses: what the command line gives, what it refuses, and
+methods of a user."""
 
 import json
 import shutil
@@ -14,7 +15,15 @@ from scored_dataset import make_dataset, write_description, write_predictions
 from fpp_ml_bench.cli import main, run_command
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.cli.options import WORKING_RANGE, command, command_line, given, names, value
-from fpp_ml_bench.options import REQUIRED, argument, described, did_you_mean, flag_of, option, options_of
+from fpp_ml_bench.options import (
+    REQUIRED,
+    argument,
+    described,
+    did_you_mean,
+    flag_of,
+    option,
+    options_of,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +52,12 @@ def shoot(
 
     What the help leaves out."""
     found = {"subject": subject, "frames": frames, "out": str(out), "count": count, "near": near}
-    found |= {"mesh": [str(path) for path in mesh], "focal": lens.focal, "kind": lens.kind, "sharp": lens.sharp}
+    found |= {
+        "mesh": [str(path) for path in mesh],
+        "focal": lens.focal,
+        "kind": lens.kind,
+        "sharp": lens.sharp,
+    }
     if json is not None:
         json.write_text(globals()["json"].dumps(found))
     print(found, given(lens, Lens), command_line())
@@ -59,9 +73,16 @@ def test_a_command_gets_what_the_line_says_and_defaults_of_its_fields(capsys):
     status, out = shot(capsys, "mug --out here")
     assert status == 0 and "'frames': ()" in out and "'count': 2, 'near': None, 'mesh': []" in out
     assert "'focal': 8.0, 'kind': 'wide', 'sharp': True} [] fpp-bench shoot mug --out here" in out
-    words = "mug 3 4 --mesh a.ply --mesh b.ply --near 1,2.5 --count 7 --out=here --focal 4 --dull --kind tele"
+    words = (
+        "mug 3 4 --mesh a.ply --mesh b.ply --near 1,2.5 --count 7 --out=here --focal 4 --dull "
+        "--kind tele"
+    )
     status, out = shot(capsys, words)
-    assert status == 0 and "'frames': (3, 4)" in out and "'near': (1.0, 2.5), 'mesh': ['a.ply', 'b.ply']" in out
+    assert (
+        status == 0
+        and "'frames': (3, 4)" in out
+        and "'near': (1.0, 2.5), 'mesh': ['a.ply', 'b.ply']" in out
+    )
     assert "'focal': 4.0, 'kind': 'tele', 'sharp': False} ['--focal', '--kind', '--dull']" in out
     assert f"fpp-bench shoot {words}" in out
 
@@ -107,7 +128,11 @@ def test_json_on_standard_output_stands_alone(tmp_path, capsys):
 def test_fields_describe_themselves():
     focal, kind, sharp = options_of(Lens)
     assert [flag_of(entry) for entry in options_of(Lens)] == ["--focal", "--kind", "--dull"]
-    assert described(kind).choices == ("wide", "tele") and described(focal).metavar == "MM" and sharp.default
+    assert (
+        described(kind).choices == ("wide", "tele")
+        and described(focal).metavar == "MM"
+        and sharp.default
+    )
     assert options_of(None) == []
     assert names(" a, b,,c ") == ("a", "b", "c")
     with pytest.raises(ValueError, match="expected an even number"):
@@ -161,7 +186,10 @@ def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny, ca
     assert settings == {"lit": 200, "steps": False, "source_sha256": settings["source_sha256"]}
     assert main(["predict", "mine.py:Mine", "--help"]) == 0
     out = capsys.readouterr().out
-    assert "mine (everything lit):\n  --lit GREY  grey level above which a pixel is lit" in out and "classical (" in out
+    assert (
+        "mine (everything lit):\n  --lit GREY  grey level above which a pixel is lit" in out
+        and "classical (" in out
+    )
 
 
 @pytest.mark.parametrize(
@@ -172,9 +200,15 @@ def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny, ca
             ["mine.py:Mine", "--frames", "3"],
             "--frames is an option of phase, crossed, not of mine.py:Mine; leave it out",
         ),
-        (["mine.py:Clashing"], "its option --split is one of fpp-bench predict; give it another flag"),
+        (
+            ["mine.py:Clashing"],
+            "its option --split is one of fpp-bench predict; give it another flag",
+        ),
         (["mine.py:Min"], "did you mean 'Mine'"),
-        (["phase", "--frames", "3", "--error-mm", "1"], "--frames and --error-mm: give one of them"),
+        (
+            ["phase", "--frames", "3", "--error-mm", "1"],
+            "--frames and --error-mm: give one of them",
+        ),
         (["phas"], "unknown method 'phas'; did you mean 'phase'"),
     ],
 )
@@ -202,7 +236,10 @@ def test_a_used_folder_is_refused_before_the_bar(mine, tiny, capsys):
     Path("used/notes.txt").write_text("mine")
     assert main(["predict", "constant", str(tiny), "--out", "used"]) == 2
     error = capsys.readouterr().err
-    assert "already holds notes.txt; give a new or empty folder, or remove this one" in error and "0%" not in error
+    assert (
+        "already holds notes.txt; give a new or empty folder, or remove this one" in error
+        and "0%" not in error
+    )
 
 
 def test_a_word_that_no_argument_takes_may_be_the_missing_option(mine, capsys):
@@ -234,7 +271,9 @@ def predicted(tiny, tmp_path, monkeypatch):
     """A copy of a dataset, and predictions of it, in the current folder."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny, "data")
-    assert main(["predict", "constant", "data", "--split", "validation", "--out", "predictions"]) == 0
+    assert (
+        main(["predict", "constant", "data", "--split", "validation", "--out", "predictions"]) == 0
+    )
 
 
 def score(*words):
@@ -247,7 +286,11 @@ def test_predictions_say_what_was_predicted(predicted, tmp_path, monkeypatch):
     assert block["dataset"] == str(tmp_path / "data") and block["split"] == "validation"
     assert {"validation/frame_00", "validation/depth", "validation/flags"} <= set(block["content"])
     status, result = score()
-    assert status == 0 and result["dataset"]["split"] == "validation" and "predicted" not in result["submission"]
+    assert (
+        status == 0
+        and result["dataset"]["split"] == "validation"
+        and "predicted" not in result["submission"]
+    )
     assert result["metrics"] == score("data", "--split", "validation")[1]["metrics"]
     assert score("data")[1]["dataset"]["split"] == "validation"
     assert score("--split", "test")[0] == 2  # those were not predicted
@@ -268,7 +311,16 @@ def test_a_dataset_that_was_moved_is_asked_for(predicted, capsys):
 
 def test_a_dataset_that_was_changed_is_refused(predicted, capsys):
     shutil.rmtree("data")
-    words = ["--objects", "mug,cork,bowl,power_drill", "--size", "176", "--seed", "1", "--workers", "1"]
+    words = [
+        "--objects",
+        "mug,cork,bowl,power_drill",
+        "--size",
+        "176",
+        "--seed",
+        "1",
+        "--workers",
+        "1",
+    ]
     assert main(["build", "--out", "data", *words]) == 0
     assert score()[0] == 2
     error = capsys.readouterr().err
@@ -282,8 +334,8 @@ def test_a_description_by_hand_needs_the_dataset(tmp_path, monkeypatch, capsys):
     write_predictions(tmp_path / "predictions", dataset)
     assert score()[0] == 2
     assert (
-        "does not say (predicted:) what was predicted; give the dataset: fpp-eval predictions DATASET"
-        in capsys.readouterr().err
+        "does not say (predicted:) what was predicted; give the dataset: fpp-eval predictions "
+        "DATASET" in capsys.readouterr().err
     )
     assert score("data")[0] == 0
 
@@ -294,7 +346,10 @@ def test_a_slip_in_the_name_of_a_command_is_no_folder(tmp_path, monkeypatch, cap
     assert "unknown command 'chek'; did you mean 'check'?" in capsys.readouterr().err
     Path("chek").mkdir()
     assert fpp_eval(["chek", "data"]) == 2
-    assert "can't be scored" not in (error := capsys.readouterr().err) and "unknown command" not in error
+    assert (
+        "can't be scored" not in (error := capsys.readouterr().err)
+        and "unknown command" not in error
+    )
 
 
 def test_click_is_told_to_take_no_defaults_from_the_environment(monkeypatch):
@@ -305,18 +360,41 @@ def test_click_is_told_to_take_no_defaults_from_the_environment(monkeypatch):
 
 
 def test_predictions_of_another_dataset_are_refused(predicted, capsys, tmp_path):
-    words = ["--objects", "mug,cork", "--size", "176", "--pitch", "24", "--config", "single_shot", "--workers", "1"]
+    words = [
+        "--objects",
+        "mug,cork",
+        "--size",
+        "176",
+        "--pitch",
+        "24",
+        "--config",
+        "single_shot",
+        "--workers",
+        "1",
+    ]
     assert main(["build", "--out", "other", *words]) == 0
     capsys.readouterr()
     assert score("other", "--split", "validation") == (2, None)
     error = capsys.readouterr().err
-    assert "other: is not what predictions was predicted from, validation/frame_00 is another now" in error
+    assert (
+        "other: is not what predictions was predicted from, validation/frame_00 is another now"
+        in error
+    )
     description = yaml.safe_load(Path("predictions/submission.yaml").read_text())
     write_description(Path("predictions"), **{**description, "predicted": ...})
     assert score("other", "--split", "validation")[0] == 0  # it says nothing
 
 
 def test_the_same_data_with_fewer_frames_are_scored(predicted):
-    words = ["--objects", "mug,cork,bowl,power_drill", "--size", "176", "--config", "single_shot", "--workers", "1"]
+    words = [
+        "--objects",
+        "mug,cork,bowl,power_drill",
+        "--size",
+        "176",
+        "--config",
+        "single_shot",
+        "--workers",
+        "1",
+    ]
     assert main(["build", "--out", "fewer", *words]) == 0
     assert score("fewer", "--split", "validation")[0] == 0

@@ -1,4 +1,5 @@
-"""Tables of the terminal at several widths: what names a row is never cut, and what is left out is said."""
+"""Tables of the terminal at several widths: what names a row is never cut, and what is left out is
+said."""
 
 import io
 import re
@@ -41,7 +42,8 @@ def printed(parts, width):
 
 
 def tables_in(text, name_column):
-    """Of each table the cells of its columns by title, and the titles that the line below it says are left out."""
+    """Of each table the cells of its columns by title, and the titles that the line below it says
+    are left out."""
     tables = []
     for block, below in re.findall(r"┏(.*?)└[^\n]*\n([^┏]*)", text, flags=re.DOTALL):
         head, body = block.split("┡")
@@ -53,8 +55,12 @@ def tables_in(text, name_column):
             if cells[name_column]:
                 rows.append(cells)
             else:  # the second line of a text that is wrapped between words
-                rows[-1] = [f"{above} {cell}".strip() for above, cell in zip(rows[-1], cells, strict=True)]
-        left_out = re.search(r"Left out at \d+ columns: (.*?)\. A wider terminal", " ".join(below.split()))
+                rows[-1] = [
+                    f"{above} {cell}".strip() for above, cell in zip(rows[-1], cells, strict=True)
+                ]
+        left_out = re.search(
+            r"Left out at \d+ columns: (.*?)\. A wider terminal", " ".join(below.split())
+        )
         columns = dict(zip(titles, zip(*rows, strict=True), strict=True))
         tables.append((columns, left_out[1].split("; ") if left_out else []))
     return tables
@@ -86,7 +92,11 @@ def test_a_result_keeps_its_pixel_sets_objects_and_samples(result, width):
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_comparison_keeps_its_errors(result, width):
     ((columns, _),) = check([comparison_table(compare_results(result, result))], width)
-    errors = (f"{pixels} {error}" for pixels in ("overall", "object", "background") for error in ("MAE", "RMSE"))
+    errors = (
+        f"{pixels} {error}"
+        for pixels in ("overall", "object", "background")
+        for error in ("MAE", "RMSE")
+    )
     assert columns["Error"] == (*errors, "two-sided MAE")
 
 
@@ -101,7 +111,10 @@ def test_the_shipped_rows_keep_their_names_and_their_errors(groups, width):
         ranked = any(row.best_rank is not None for row in group.rows)
         ((columns, left_out),) = check(group_tables([group]), width, int(ranked))
         assert columns["Method"] == tuple(row.short_name for row in group.rows)
-        assert {"Two-sided MAE", "Object MAE"} & set(columns) and {"Object MAE", "s/sample"} <= {*columns, *left_out}
+        assert {"Two-sided MAE", "Object MAE"} & set(columns) and {"Object MAE", "s/sample"} <= {
+            *columns,
+            *left_out,
+        }
         assert left_out or width == 200
 
 
@@ -114,7 +127,11 @@ def test_tables_of_others_keep_their_rows(width):
 
 @pytest.mark.parametrize(
     ("sort", "title"),
-    [("object_edge_mae_mm", "Edge MAE"), ("object_p95_mm", "object p95"), ("seconds_per_sample", "s/sample")],
+    [
+        ("object_edge_mae_mm", "Edge MAE"),
+        ("object_p95_mm", "object p95"),
+        ("seconds_per_sample", "s/sample"),
+    ],
 )
 def test_what_rows_are_sorted_by_is_never_left_out(groups, sort, title):
     text = printed(group_tables(rank_files([row.entry for row in groups[0].rows], sort)), 80)
@@ -123,14 +140,24 @@ def test_what_rows_are_sorted_by_is_never_left_out(groups, sort, title):
 
 def test_columns_are_left_out_in_the_declared_order():
     def titles(width):
-        table = Table("name", numbers=("a", "b", "c", "d"), first_out=("b", "a"), elsewhere="--json FILE")
+        table = Table(
+            "name", numbers=("a", "b", "c", "d"), first_out=("b", "a"), elsewhere="--json FILE"
+        )
         table.add_row("a name of 21 letters.", *["1234567"] * 4)
         text = printed([table], width)
         assert "a name of 21 letters." in text
         assert ("and so does --json FILE." in " ".join(text.split())) == (width < 65)
         return "".join(tables_in(text, 0)[0][0]).removeprefix("name")
 
-    assert [titles(width) for width in (65, 64, 55, 54, 45, 44, 35)] == ["abcd", "acd", "acd", "cd", "cd", "c", "c"]
+    assert [titles(width) for width in (65, 64, 55, 54, 45, 44, 35)] == [
+        "abcd",
+        "acd",
+        "acd",
+        "cd",
+        "cd",
+        "c",
+        "c",
+    ]
 
 
 def test_a_name_wider_than_the_terminal_is_wrapped_and_not_cut():

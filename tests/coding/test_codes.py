@@ -1,4 +1,5 @@
-"""Coding schemes: patterns in, coordinates out, against `fringes`-free closed forms, OpenCV, and themselves."""
+"""Coding schemes: patterns in, coordinates out, against `fringes`-free closed forms, OpenCV, and
+themselves."""
 
 import math
 
@@ -22,9 +23,24 @@ CODES = {
     "hierarchy": {"scheme": "phase-shift", "pitches_px": [1000, 200, 25], "steps": [4, 4, 6]},
     "heterodyne": {"scheme": "phase-shift", "pitches_px": [42, 45, 48], "steps": 4},
     "number-theoretical": {"scheme": "phase-shift", "pitches_px": [29, 33], "steps": 5},
-    "own shifts": {"scheme": "phase-shift", "pitch_px": 24, "shifts_deg": [0, 90, 200, 250], "gray": {}},
-    "whole-period cells": {"scheme": "phase-shift", "pitch_px": 24, "steps": 4, "gray": {"cell_px": 24}},
-    "inverses": {"scheme": "phase-shift", "pitch_px": 36, "steps": 3, "gray": {"inverse": "after all"}},
+    "own shifts": {
+        "scheme": "phase-shift",
+        "pitch_px": 24,
+        "shifts_deg": [0, 90, 200, 250],
+        "gray": {},
+    },
+    "whole-period cells": {
+        "scheme": "phase-shift",
+        "pitch_px": 24,
+        "steps": 4,
+        "gray": {"cell_px": 24},
+    },
+    "inverses": {
+        "scheme": "phase-shift",
+        "pitch_px": 36,
+        "steps": 3,
+        "gray": {"inverse": "after all"},
+    },
     "origin": {"scheme": "phase-shift", "pitches_px": [60, 920], "steps": 4, "origin_px": -3.5},
     "gray alone": {"scheme": "gray", "cell_px": 2},
     "gray in pairs": {"scheme": "gray", "cell_px": 4, "inverse": "after each", "least_first": True},
@@ -44,10 +60,18 @@ def code_of(name):
 
 
 def seen(code, position_px, mean=120.0, amplitude=100.0, noise=0.0, seed=0):
-    """Grey levels at sub-pixel positions of the patterns, with black and white where the code needs them."""
-    levels = np.stack([np.interp(position_px, np.arange(LENGTH), row) for row in code.profiles(LENGTH).astype(float)])
+    """Grey levels at sub-pixel positions of the patterns, with black and white where the code needs
+    them."""
+    levels = np.stack(
+        [
+            np.interp(position_px, np.arange(LENGTH), row)
+            for row in code.profiles(LENGTH).astype(float)
+        ]
+    )
     if code.needs_flat:
-        levels = np.concatenate([levels, np.zeros((1, len(position_px))), np.full((1, len(position_px)), 255.0)])
+        levels = np.concatenate(
+            [levels, np.zeros((1, len(position_px))), np.full((1, len(position_px)), 255.0)]
+        )
     grey = mean + amplitude * (levels / 127.5 - 1)
     return (grey + np.random.default_rng(seed).normal(0, noise, grey.shape)).astype(np.float32)
 
@@ -58,7 +82,8 @@ def test_a_code_gives_its_own_pixels_back(name):
     found = code.decode(seen(code, pixels, 127.5, 127.5), LENGTH, Limits(max_clipped_steps=20))
     good = found.reason == Reason.DECODED
     assert good.mean() > (0.9 if name == "whole-period cells" else 0.99)
-    # 8-bit patterns are rounded to half a grey level of 127.5; a cell knows its pixels to half its width.
+    # 8-bit patterns are rounded to half a grey level of 127.5; a cell knows its pixels to half its
+    # width.
     bound = code.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
     assert np.abs(found.coordinate_px - pixels)[good].max() <= bound
     assert code.step_px == (bound if isinstance(code, GrayOnly) else 0)
@@ -89,16 +114,23 @@ def test_cells_begin_at_their_origin_and_either_bit_comes_first():
     centred, usual = GrayCells(1, 10, origin_px=-56).profiles(912), GrayCells(1, 10).profiles(1024)
     assert np.array_equal(centred, usual[:, 56:968])
     assert np.array_equal(GrayCells(1, 10, least_first=True).profiles(1024), usual[::-1])
-    # 3 px per cell from -4: pixels 0 and 1 are the rest of cell 1, and the last pixel is alone in cell 305.
+    # 3 px per cell from -4: pixels 0 and 1 are the rest of cell 1, and the last pixel is alone in
+    # cell 305.
     cells = GrayCells.from_entries({"cell_px": 3, "origin_px": -4}, LENGTH)
-    assert cells.bits == 9 and cells.centre_px(np.array([0, 1, 2, 305, 306]), LENGTH)[1:4].tolist() == [0.5, 3, 911]
+    assert cells.bits == 9 and cells.centre_px(np.array([0, 1, 2, 305, 306]), LENGTH)[
+        1:4
+    ].tolist() == [0.5, 3, 911]
     assert np.isnan(cells.centre_px(np.array([0, 306]), LENGTH)).all()
 
 
 def test_a_rig_dictionary_names_only_what_is_unusual():
     usual = {"cell_px": 2, "bits": 9, "inverse": "none"}
     assert GrayCells(2, 9).to_dict() == usual
-    assert GrayCells(2, 9, "none", -3.0, True).to_dict() == {**usual, "origin_px": -3.0, "least_first": True}
+    assert GrayCells(2, 9, "none", -3.0, True).to_dict() == {
+        **usual,
+        "origin_px": -3.0,
+        "least_first": True,
+    }
 
 
 def test_pairs_need_no_white_and_black():
@@ -110,7 +142,12 @@ def test_pairs_need_no_white_and_black():
     levels[:, 1] = 255.0
     levels[:2, 2] = 255.0  # both of one pair
     found = code.decode(levels, LENGTH, LIMITS)
-    assert found.reason.tolist() == [Reason.LOW_MODULATION, Reason.LOW_MODULATION, Reason.SATURATED, Reason.DECODED]
+    assert found.reason.tolist() == [
+        Reason.LOW_MODULATION,
+        Reason.LOW_MODULATION,
+        Reason.SATURATED,
+        Reason.DECODED,
+    ]
     assert found.coordinate_px[3] == 301.5 and found.modulation[3] == pytest.approx(100)
 
 
@@ -123,14 +160,19 @@ def test_dark_saturated_and_contradicting_pixels_have_their_reason():
     levels[4:8, 2] = levels[4:8, 2][::-1] + 40 * np.array([1, -1, -1, 1])
     found = code.decode(levels, LENGTH, LIMITS)
     assert found.reason.tolist()[:2] == [Reason.LOW_MODULATION, Reason.LOW_MODULATION]
-    assert found.reason[3] == Reason.DECODED and found.coordinate_px[3] == pytest.approx(300.25, abs=0.05)
+    assert found.reason[3] == Reason.DECODED and found.coordinate_px[3] == pytest.approx(
+        300.25, abs=0.05
+    )
     bright = seen(code, position, mean=200, amplitude=100).clip(0, 255)
     assert (code.decode(bright, LENGTH, LIMITS).reason == Reason.SATURATED).all()
 
 
 def test_a_single_period_shorter_than_the_pattern_has_no_order():
     code = code_from_dict({"scheme": "phase-shift", "pitch_px": 57, "steps": 4}, LENGTH, "code")
-    assert (code.decode(seen(code, np.array([100.0, 500.0])), LENGTH, LIMITS).reason == Reason.INCONSISTENT_ORDER).all()
+    assert (
+        code.decode(seen(code, np.array([100.0, 500.0])), LENGTH, LIMITS).reason
+        == Reason.INCONSISTENT_ORDER
+    ).all()
     whole = code_from_dict({"scheme": "phase-shift", "pitch_px": 912, "steps": 4}, LENGTH, "code")
     found = whole.decode(seen(whole, np.array([100.0, 500.0])), LENGTH, LIMITS)
     np.testing.assert_allclose(found.coordinate_px, [100, 500], atol=0.6)
@@ -155,7 +197,11 @@ def test_a_rig_file_holds_every_code(name, tmp_path):
     rig = rig_from_dict(coded_rig(order=order, vertical=CODES[name]))
     save_rig(rig, tmp_path / "rig.yaml")
     assert load_rig(tmp_path / "rig.yaml") == rig
-    assert isinstance(rig.sequence, CodedSequence) and rig.directions == ("vertical",) and rig.background_m is None
+    assert (
+        isinstance(rig.sequence, CodedSequence)
+        and rig.directions == ("vertical",)
+        and rig.background_m is None
+    )
     assert len(rig.sequence) == len(rig.code("vertical").shown) + 2 and rig.sequence.white == 0
     assert np.array_equal(pattern_image(rig, 1)[0], rig.code("vertical").profiles(912)[0])
     assert rig.code("vertical").scheme in SCHEMES
@@ -185,18 +231,62 @@ def test_single_frames_are_described_and_made_but_not_decoded_pixel_by_pixel():
         ({"order": ["vertical"]}, "no direction is coded"),
         ({"vertical": {"scheme": "magic"}}, "vertical.scheme: expected phase-shift, gray"),
         ({"vertical": {"scheme": "phase-shift", "pitch_px": 18}}, "steps: missing"),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": 0}}, "sign: expected 1"),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "colour": 1}}, "colour: unknown key"),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "shifts_deg": [0], "steps": 3}}, "not both"),
-        ({"vertical": {"scheme": "phase-shift", "pitches_px": [18, 36], "steps": [3]}}, "each of 2 periods"),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "gray": {"bits": 2}}}, "need 7 bits"),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "gray": {"cell_px": 20}}}, "exceed"),
-        ({"vertical": {"scheme": "gray", "inverse": "yes"}, "order": ["vertical"]}, "inverse: expected none"),
+        (
+            {"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": 0}},
+            "sign: expected 1",
+        ),
+        (
+            {"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "colour": 1}},
+            "colour: unknown key",
+        ),
+        (
+            {"vertical": {"scheme": "phase-shift", "pitch_px": 18, "shifts_deg": [0], "steps": 3}},
+            "not both",
+        ),
+        (
+            {"vertical": {"scheme": "phase-shift", "pitches_px": [18, 36], "steps": [3]}},
+            "each of 2 periods",
+        ),
+        (
+            {
+                "vertical": {
+                    "scheme": "phase-shift",
+                    "pitch_px": 18,
+                    "steps": 3,
+                    "gray": {"bits": 2},
+                }
+            },
+            "need 7 bits",
+        ),
+        (
+            {
+                "vertical": {
+                    "scheme": "phase-shift",
+                    "pitch_px": 18,
+                    "steps": 3,
+                    "gray": {"cell_px": 20},
+                }
+            },
+            "exceed",
+        ),
+        (
+            {"vertical": {"scheme": "gray", "inverse": "yes"}, "order": ["vertical"]},
+            "inverse: expected none",
+        ),
         ({"vertical": {"scheme": "gray"}, "order": ["vertical"]}, "black, white missing"),
-        ({"vertical": {"scheme": "gray", "origin_px": 1}}, "vertical.origin_px: expected 0 or less"),
-        ({"vertical": {"scheme": "gray", "origin_px": -113, "bits": 10}}, "hold 1025 Gray cells.*need 11 bits"),
+        (
+            {"vertical": {"scheme": "gray", "origin_px": 1}},
+            "vertical.origin_px: expected 0 or less",
+        ),
+        (
+            {"vertical": {"scheme": "gray", "origin_px": -113, "bits": 10}},
+            "hold 1025 Gray cells.*need 11 bits",
+        ),
         ({"vertical": CODES["unit cue"], "order": ["vertical", "vertical"]}, "at most once"),
-        ({"vertical": CODES["unit cue"], "order": ["horizontal"]}, "expected each of vertical, black, white"),
+        (
+            {"vertical": CODES["unit cue"], "order": ["horizontal"]},
+            "expected each of vertical, black, white",
+        ),
         ({"vertical": {"scheme": "composite", "pitches_px": [18]}}, "two periods and more"),
         ({"vertical": {"scheme": "composite", "pitches_px": [18, 2]}}, "4 px and more"),
     ],

@@ -1,4 +1,5 @@
-"""Crossed fringes: two carriers in a frame, in a rig file, as an image, and as the mean of a pair of frames."""
+"""Crossed fringes: two carriers in a frame, in a rig file, as an image, and as the mean of a pair
+of frames."""
 
 import numpy as np
 import pytest
@@ -12,7 +13,12 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
 from fpp_ml_bench.optics.sequence import CodedSequence
 
-FAMILY = {"pitches_px": [18, 14.5], "angles_deg": [30, 100], "weights": [0.6, 0.3], "shifts_deg": [[0, 0], [120, 45]]}
+FAMILY = {
+    "pitches_px": [18, 14.5],
+    "angles_deg": [30, 100],
+    "weights": [0.6, 0.3],
+    "shifts_deg": [[0, 0], [120, 45]],
+}
 
 
 def rig_of(**sequence) -> dict:
@@ -25,9 +31,13 @@ def test_each_frame_is_the_sum_of_two_shifted_carriers():
     family = Crossed.from_entries(FAMILY)
     v, u = np.mgrid[:40, :50]
     for n, (first_shift, second_shift) in enumerate(FAMILY["shifts_deg"]):
-        first = (v * np.cos(np.radians(30)) + u * np.sin(np.radians(30))) / 18 * 2 * np.pi + np.radians(first_shift)
+        first = (
+            v * np.cos(np.radians(30)) + u * np.sin(np.radians(30))
+        ) / 18 * 2 * np.pi + np.radians(first_shift)
         second = (v * np.cos(np.radians(100)) + u * np.sin(np.radians(100))) / 14.5 * 2 * np.pi
-        expected = 127.5 + 127.5 * (0.6 * np.cos(first) + 0.3 * np.cos(second + np.radians(second_shift)))
+        expected = 127.5 + 127.5 * (
+            0.6 * np.cos(first) + 0.3 * np.cos(second + np.radians(second_shift))
+        )
         image = family.image(50, 40, n)
         assert image.dtype == np.uint8 and image.shape == (40, 50)
         assert np.abs(image - expected).max() <= 0.5 + 1e-9
@@ -62,15 +72,21 @@ def test_a_rig_file_holds_crossed_fringes_beside_codes_or_alone(tmp_path):
 
 def test_the_crossed_rig_is_the_papers_with_three_frames_before_its_own():
     rig, paper = crossed_rig(96), paper_rig(96)
-    assert rig.sequence.config("crossed") == (0, 1, 2) and rig.sequence.config("single_shot") == (0,)
+    assert rig.sequence.config("crossed") == (0, 1, 2) and rig.sequence.config("single_shot") == (
+        0,
+    )
     assert paper.sequence.config("crossed") == () and paper.crossed is None
     assert isinstance(rig.sequence, CodedSequence) and len(rig.sequence) == 55
     for direction in ("horizontal", "vertical"):
         assert rig.code(direction) == paper.code(direction) and rig.code(direction).is_plain
-        for own, of_paper in zip(rig.sequence.coded(direction), paper.sequence.coded(direction), strict=True):
+        for own, of_paper in zip(
+            rig.sequence.coded(direction), paper.sequence.coded(direction), strict=True
+        ):
             assert np.array_equal(pattern_image(rig, own), pattern_image(paper, of_paper))
     cycles = [rig.image_px_of_carrier(cycles) for cycles in Crossed((18.0, 18.0)).cycles_per_px]
-    np.testing.assert_allclose(cycles, [rig.image_px_per_period(d) for d in ("horizontal", "vertical")])
+    np.testing.assert_allclose(
+        cycles, [rig.image_px_per_period(d) for d in ("horizontal", "vertical")]
+    )
     with pytest.raises(RigError, match=r"carrier 1 covers only 2\.51 px of a 160 px image"):
         crossed_rig(160).check_sampling()
 

@@ -1,4 +1,5 @@
-"""The half-period Gray code: against its definition, at every sub-pixel position, with noise, blur and damage."""
+"""The half-period Gray code: against its definition, at every sub-pixel position, with noise, blur
+and damage."""
 
 import numpy as np
 import pytest
@@ -46,12 +47,15 @@ def test_centres_are_the_means_of_the_pixels(pitch):
     length = round(pitch * 6)
     position = np.arange(2 * length)
     cell = cell_of(position, pitch)
-    expected = [position[cell == j].mean() * 2 * np.pi / pitch for j in range(cell_count(length, pitch))]
+    expected = [
+        position[cell == j].mean() * 2 * np.pi / pitch for j in range(cell_count(length, pitch))
+    ]
     np.testing.assert_allclose(cell_centres_rad(length, pitch), expected, atol=1e-12)
 
 
 def decoded(levels, pitch, length, steps):
-    """What the code of a period in equal steps and Gray code in half periods makes of grey levels (frames, n)."""
+    """What the code of a period in equal steps and Gray code in half periods makes of grey levels
+    (frames, n)."""
     return code_of(pitch, len(levels) - steps, steps).decode(levels, length, Limits())
 
 
@@ -60,31 +64,39 @@ def code_of(pitch, bits, steps):
 
 
 def captured_at(u, pitch, blur_px, noise, modulation, gray_shift_px=0.0):
-    """Grey levels (frames, n) at sub-pixel positions u of 18 steps and the code, box-blurred as by a camera pixel; the
-    code is displaced by ``gray_shift_px`` against the sinusoids, as a misread edge would be."""
+    """Grey levels (frames, n) at sub-pixel positions u of 18 steps and the code, box-blurred as by
+    a camera pixel; the code is displaced by ``gray_shift_px`` against the sinusoids, as a misread
+    edge would be."""
     profiles = code_of(pitch, bits_needed(912, pitch), 18).profiles(912)
     levels = []
     for row, profile in enumerate(profiles):
         at = u + (gray_shift_px if row >= 18 else 0.0)
         offsets = blur_px * np.linspace(-0.5, 0.5, 9)
-        levels.append(np.mean([np.interp(at + offset, np.arange(912), profile) for offset in offsets], axis=0))
+        levels.append(
+            np.mean([np.interp(at + offset, np.arange(912), profile) for offset in offsets], axis=0)
+        )
     error = noise * np.random.default_rng(1).standard_normal((len(levels), u.size))
     return np.clip(np.rint(10 + modulation / 127.5 * np.array(levels) + error), 0, 255)
 
 
 @pytest.mark.parametrize("pitch", [18, 12.8, 6])
-@pytest.mark.parametrize("blur_px, noise, modulation", [(0.0, 1.0, 60.0), (1.5, 2.0, 40.0), (3.0, 1.5, 25.0)])
+@pytest.mark.parametrize(
+    "blur_px, noise, modulation", [(0.0, 1.0, 60.0), (1.5, 2.0, 40.0), (3.0, 1.5, 25.0)]
+)
 def test_no_position_ever_slips_a_period(pitch, blur_px, noise, modulation):
     u = np.arange(2, 909, 0.0137)
     measured = decoded(captured_at(u, pitch, blur_px, noise, modulation), pitch, 912, 18)
     trusted = measured.reason == Reason.DECODED
-    assert np.abs(measured.coordinate_px - u)[trusted].max() < pitch / 8  # an order wrong by 1 is a whole pitch
+    assert (
+        np.abs(measured.coordinate_px - u)[trusted].max() < pitch / 8
+    )  # an order wrong by 1 is a whole pitch
     assert trusted.mean() > 0.999
 
 
 @pytest.mark.parametrize("shift", [-4.0, 4.0])
 def test_code_edges_may_be_off_by_almost_a_quarter_period(shift):
-    """Misread cells at the edges: displaced by up to 4 px of 18, under a quarter period (4.5 px), no order is wrong."""
+    """Misread cells at the edges: displaced by up to 4 px of 18, under a quarter period (4.5 px),
+    no order is wrong."""
     u = np.arange(6, 900, 0.05)
     measured = decoded(captured_at(u, 18, 1.0, 0.5, 60.0, gray_shift_px=shift), 18, 912, 18)
     assert np.abs(measured.coordinate_px - u).max() < 1.0
@@ -93,7 +105,10 @@ def test_code_edges_may_be_off_by_almost_a_quarter_period(shift):
 def test_a_single_ambiguous_bit_is_trusted_only_at_its_edge():
     bits, mean, modulation = 5, np.full((1, 1), 100.0), np.full((1, 1), 50.0)
     for cell in range(2**bits):
-        code = [100 + 50 * (1 if binary_to_gray(cell) >> (bits - 1 - b) & 1 else -1) for b in range(bits)]
+        code = [
+            100 + 50 * (1 if binary_to_gray(cell) >> (bits - 1 - b) & 1 else -1)
+            for b in range(bits)
+        ]
         for blurred in range(bits):
             frames = np.array(code, dtype=float).reshape(bits, 1, 1)
             frames[blurred] = 100 + (3 if frames[blurred] > 100 else -3)
@@ -102,7 +117,9 @@ def test_a_single_ambiguous_bit_is_trusted_only_at_its_edge():
             assert cells[0, 0] == cell
             assert trusted[0, 0] == (abs(int(neighbour) - cell) == 1)
             frames[(blurred + 1) % bits] = 101
-            assert not decode_cells(frames, mean, modulation)[1].any()  # two ambiguous bits are never trusted
+            assert not decode_cells(frames, mean, modulation)[
+                1
+            ].any()  # two ambiguous bits are never trusted
 
 
 def test_phase_on_the_far_side_of_the_circle_and_cells_off_the_pattern_are_rejected():

@@ -35,7 +35,9 @@ def test_exact_frames_give_exact_phase(count, dtype, rounding):
 def test_equal_steps_are_the_papers_equation():
     frames = np.random.default_rng(0).integers(0, 256, (18, 20, 30), dtype=np.uint8)
     delta = equal(18).reshape(-1, 1, 1)
-    expected = -np.arctan2((frames * np.sin(delta)).sum(axis=0), (frames * np.cos(delta)).sum(axis=0))
+    expected = -np.arctan2(
+        (frames * np.sin(delta)).sum(axis=0), (frames * np.cos(delta)).sum(axis=0)
+    )
     np.testing.assert_allclose(wrapped_phase(frames).phase, expected, atol=1e-12)
 
 
@@ -49,10 +51,16 @@ def test_plus_pi_comes_out_as_minus_pi(dtype):
     assert wrapped.phase[0, 0] == np.float32(-np.pi)
 
 
-@given(st.lists(st.floats(0, 6.28), min_size=3, max_size=9), st.floats(-3.1, 3.1), st.floats(1, 120))
+@given(
+    st.lists(st.floats(0, 6.28), min_size=3, max_size=9), st.floats(-3.1, 3.1), st.floats(1, 120)
+)
 @settings(max_examples=150, deadline=None)
-def test_any_shifts_that_determine_a_phase_give_it_and_the_others_are_refused(shifts, phase, modulation):
-    condition = np.linalg.cond(np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1))
+def test_any_shifts_that_determine_a_phase_give_it_and_the_others_are_refused(
+    shifts, phase, modulation
+):
+    condition = np.linalg.cond(
+        np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
+    )
     if condition > 1e6:
         with pytest.raises(DecodeError, match="don't determine"):
             phase_weights(shifts)
@@ -98,7 +106,11 @@ def test_the_clipping_that_the_decoder_allows_moves_the_phase_by_under_five_mrad
     "frames, arguments, message",
     [
         (np.zeros((2, 3, 3)), {}, "at least 3 frames, got 2"),
-        ([np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4))], {}, r"frame 2: expected shape.*\(3, 4\)"),
+        (
+            [np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4))],
+            {},
+            r"frame 2: expected shape.*\(3, 4\)",
+        ),
         (np.zeros((3, 3, 3), dtype=complex), {}, "dtype complex128"),
         (np.zeros((3, 3, 3)), {"dtype": np.float16}, "float32 or float64"),
         (np.zeros((3, 3, 3)), {"shifts_rad": [0, 1, 2, 3]}, "each of the 3 frames, got 4"),
@@ -113,4 +125,6 @@ def test_frames_that_hold_no_phase_are_refused(frames, arguments, message):
 def test_weights_of_the_chosen_subset_are_the_least_squares_solution():
     shifts = 2 * np.pi * np.array([0, 4, 7, 11, 14]) / 18
     model = np.stack([np.ones(5), np.cos(shifts), np.sin(shifts)], axis=1)
-    np.testing.assert_allclose(phase_weights(shifts), np.linalg.lstsq(model, np.eye(5), rcond=None)[0], atol=1e-14)
+    np.testing.assert_allclose(
+        phase_weights(shifts), np.linalg.lstsq(model, np.eye(5), rcond=None)[0], atol=1e-14
+    )

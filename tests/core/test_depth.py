@@ -23,7 +23,10 @@ from fpp_ml_bench.depth import (
 
 def drawn(text):
     """One character per pixel: '.' background, digits are depth steps of 100 mm from 1500 mm."""
-    return np.array([[0.0 if c == "." else 1500 + 100 * int(c) for c in line] for line in text.split()], np.float32)
+    return np.array(
+        [[0.0 if c == "." else 1500 + 100 * int(c) for c in line] for line in text.split()],
+        np.float32,
+    )
 
 
 def marked(text):
@@ -36,9 +39,14 @@ def test_object_is_depth_above_zero():
 
 
 def test_extremes_are_those_of_every_block_and_carry_nan():
-    values = np.random.default_rng(1).normal(0, 1, (300, 450)).astype(np.float32)  # more than two blocks
+    values = (
+        np.random.default_rng(1).normal(0, 1, (300, 450)).astype(np.float32)
+    )  # more than two blocks
     for order in "CF":
-        assert extremes(np.asarray(values, order=order)) == (float(values.min()), float(values.max()))
+        assert extremes(np.asarray(values, order=order)) == (
+            float(values.min()),
+            float(values.max()),
+        )
     assert extremes(np.array([[np.inf, -np.inf]], np.float16)) == (-np.inf, np.inf)
     values[299, 449] = np.nan
     assert np.isnan(extremes(values)).all()
@@ -46,7 +54,12 @@ def test_extremes_are_those_of_every_block_and_carry_nan():
 
 @pytest.mark.parametrize(
     ("pixels", "box"),
-    [([], None), ([(2, 3)], np.s_[1:4, 2:5]), ([(0, 0), (4, 6)], np.s_[0:6, 0:8]), ([(5, 7)], np.s_[4:7, 6:9])],
+    [
+        ([], None),
+        ([(2, 3)], np.s_[1:4, 2:5]),
+        ([(0, 0), (4, 6)], np.s_[0:6, 0:8]),
+        ([(5, 7)], np.s_[4:7, 6:9]),
+    ],
 )
 def test_the_box_is_one_pixel_around_the_object(pixels, box):
     inside = np.zeros((6, 8), bool)
@@ -86,7 +99,9 @@ def test_default_jump_grows_with_the_pixel_footprint(size, jump):
 
 
 maps = arrays(
-    np.float32, st.tuples(st.integers(2, 14), st.integers(2, 14)), elements=st.sampled_from([0, 1500, 1505, 1900])
+    np.float32,
+    st.tuples(st.integers(2, 14), st.integers(2, 14)),
+    elements=st.sampled_from([0, 1500, 1505, 1900]),
 )
 
 
@@ -127,7 +142,8 @@ def test_is_the_papers_equation_up_to_rounding(name):
     depth, low, high = depth_map()
     normalised = normalise(depth, name, low, high)
     assert normalised.dtype == np.float32 and normalised.shape == depth.shape
-    # At most two float32 roundings (the span, the quotient), 2**-24 each; the bound leaves a factor of two.
+    # At most two float32 roundings (the span, the quotient), 2**-24 each; the bound leaves a factor
+    # of two.
     np.testing.assert_allclose(normalised, paper(depth, name, low, high), rtol=2**-22, atol=0)
     assert (normalised[depth == 0] == 0).all()
 
@@ -138,7 +154,8 @@ def test_way_back(name):
     back = denormalise(normalise(depth, name, low, high), name, low, high)
     assert back.dtype == np.float64
     inside = depth > 0
-    # float32 roundings of 2**-24 each: none in raw, the quotient in global, span and quotient in individual.
+    # float32 roundings of 2**-24 each: none in raw, the quotient in global, span and quotient in
+    # individual.
     error_mm = {"raw": 0, "global": 2**-24 * high, "individual": 2 * 2**-24 * (high - low)}[name]
     np.testing.assert_allclose(back[inside], depth[inside], rtol=1e-12, atol=error_mm)
     expected = low if name == "individual" else 0.0
@@ -176,7 +193,9 @@ def test_unknown_names():
 @pytest.mark.parametrize("span", [0.0, 0.002, 600.0])
 def test_individual_stays_between_zero_and_one_and_in_order(span):
     low, high = np.float32(1510.123), np.float32(1510.123 + span)
-    depth = np.sort(np.random.default_rng(0).uniform(low, high, 1000).astype(np.float32).clip(low, high))
+    depth = np.sort(
+        np.random.default_rng(0).uniform(low, high, 1000).astype(np.float32).clip(low, high)
+    )
     normalised = normalise(depth[None], "individual", float(low), float(high))
     assert ((normalised >= 0) & (normalised <= 1)).all()
     assert (np.diff(normalised[0]) >= 0).all()
@@ -189,11 +208,15 @@ def test_a_range_that_float32_can_not_hold_costs_no_digits(dtype, span_mm):
     low, high = 1700.1 + span_mm / 7, 1700.1 + span_mm * 6 / 7
     exact = (depth.astype(np.longdouble) - low) / (np.longdouble(high) - low)
     # float64 rounded once to float32, 2**-24; the bound leaves a factor of two.
-    np.testing.assert_allclose(normalise(depth, "individual", low, high), exact.astype(float), rtol=2**-23, atol=1e-12)
+    np.testing.assert_allclose(
+        normalise(depth, "individual", low, high), exact.astype(float), rtol=2**-23, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("span_mm", [1e-30, 1e-40, 1e-300])
 def test_a_range_below_single_precision_is_not_divided_by_zero(span_mm):
     depth = np.linspace(0, span_mm, 60).reshape(6, 10)
     normalised = normalise(depth, "individual", 0.0, span_mm)
-    np.testing.assert_allclose(normalised.ravel(), np.linspace(0, 1, 60), rtol=0, atol=2**-24)  # one float32 rounding
+    np.testing.assert_allclose(
+        normalised.ravel(), np.linspace(0, 1, 60), rtol=0, atol=2**-24
+    )  # one float32 rounding

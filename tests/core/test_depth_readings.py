@@ -1,4 +1,5 @@
-"""Another reading of depth maps is named where it fits far better; of depths that are merely wrong nothing is said."""
+"""Another reading of depth maps is named where it fits far better; of depths that are merely wrong
+nothing is said."""
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 SIZE = 90
 CAMERA = paper_rig(SIZE).camera
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE].astype(float)
-ALONG = np.sqrt(1 + ((COLUMNS - CAMERA.cx) / CAMERA.fx) ** 2 + ((ROWS - CAMERA.cy) / CAMERA.fy) ** 2)
+ALONG = np.sqrt(
+    1 + ((COLUMNS - CAMERA.cx) / CAMERA.fx) ** 2 + ((ROWS - CAMERA.cy) / CAMERA.fy) ** 2
+)
 NOISE = np.random.default_rng(0).normal(0, 1, (6, SIZE, SIZE))
 
 
@@ -25,7 +28,10 @@ RIGHT = np.where(TRUE > 0, TRUE + NOISE, 0)
 
 
 def reading(given, true=TRUE):
-    seen = [glance(f"cork_A{60 * n}", *pair, None, CAMERA) for n, pair in enumerate(zip(given, true, strict=True))]
+    seen = [
+        glance(f"cork_A{60 * n}", *pair, None, CAMERA)
+        for n, pair in enumerate(zip(given, true, strict=True))
+    ]
     return another_reading("the maps", seen)
 
 
@@ -51,7 +57,9 @@ READ = {
 
 @pytest.mark.parametrize("words", READ)
 def test_the_reading_is_named(words):
-    assert f"the maps far better: {words}" in reading(READ[words]).replace("as those of other samples (", "")
+    assert f"the maps far better: {words}" in reading(READ[words]).replace(
+        "as those of other samples (", ""
+    )
 
 
 MERELY_WRONG = {

@@ -39,7 +39,9 @@ def test_the_account_adds_up_and_drops_lines_with_nothing_left_out():
 
 
 def test_build_and_its_account(tmp_path, capsys):
-    arguments = f"build --size {TINY_SIZE} --objects cork --config single_shot --workers 1 --out".split()
+    arguments = (
+        f"build --size {TINY_SIZE} --objects cork --config single_shot --workers 1 --out".split()
+    )
     account = tmp_path / "account.json"
     assert main([*arguments, str(tmp_path / "on"), "--explain-json", str(account)]) == 0
     assert "left out" in capsys.readouterr().out
@@ -60,7 +62,9 @@ def test_build_and_its_account(tmp_path, capsys):
 
 
 def test_under_a_lens_that_blurs_only_black_and_white_are_not_exposed(opened):
-    settings = tiny_settings(stored="single_shot", light=named_light("paper").changed("camera", blur_px=0.5))
+    settings = tiny_settings(
+        stored="single_shot", light=named_light("paper").changed("camera", blur_px=0.5)
+    )
     account = explain_build(opened.manifest, settings)
     exposures = next(line for line in account.lines if line.what == "exposures that nothing reads")
     assert (exposures.done, exposures.left_out) == (24 * 50 * PIXELS, 24 * 2 * PIXELS)
@@ -68,7 +72,10 @@ def test_under_a_lens_that_blurs_only_black_and_white_are_not_exposed(opened):
 
 def test_an_object_that_moves_is_lit_and_exposed_in_each_frame(opened):
     light = named_light("paper").changed("bounces", shadows=True).changed("camera", rays_across=1)
-    part = [{**row, "shadow_rays": 8 * PIXELS, "mixed_rays": 0} for row in opened.manifest.samples["test"]]
+    part = [
+        {**row, "shadow_rays": 8 * PIXELS, "mixed_rays": 0}
+        for row in opened.manifest.samples["test"]
+    ]
     settings = tiny_settings(stored="single_shot", light=light.changed(motion_mm=0.2))
     account = explain_build(replace(opened.manifest, samples={"test": part}), settings)
     lines = {line.what: (line.done, line.left_out) for line in account.lines}
@@ -86,27 +93,42 @@ def test_the_table_shows_all_counts_in_a_pipe(opened, monkeypatch, capsys):
 
 def test_a_dataset_of_an_earlier_version_is_refused_in_words(opened):
     rows = [
-        {key: value for key, value in row.items() if key != "mixed_rays"} for row in opened.manifest.samples["test"]
+        {key: value for key, value in row.items() if key != "mixed_rays"}
+        for row in opened.manifest.samples["test"]
     ]
     generator = {"name": "fpp-ml-bench", "version": "0.1.0"}
     with pytest.raises(BuildError, match=r"built by version 0\.1\.0 .* build it again"):
-        explain_build(replace(opened.manifest, samples={"test": rows}, generator=generator), tiny_settings())
+        explain_build(
+            replace(opened.manifest, samples={"test": rows}, generator=generator), tiny_settings()
+        )
 
 
 def test_predictions_scores_and_their_accounts(tiny, tmp_path):
     account = tmp_path / "account.json"
     for name, options in (("on", ["--explain-json", str(account)]), ("off", [])):
         with skipping(name == "on"):
-            words = ["predict", "classical", str(tiny), "--out", str(tmp_path / name), "--steps", "4", *options]
+            words = [
+                "predict",
+                "classical",
+                str(tiny),
+                "--out",
+                str(tmp_path / name),
+                "--steps",
+                "4",
+                *options,
+            ]
             assert main(words) == 0
     skipped, complete = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
     assert (
         len(skipped) == 6 * 2 + 1
-        and [name for name in skipped if name.endswith(".npy") and skipped[name] != complete[name]] == []
+        and [name for name in skipped if name.endswith(".npy") and skipped[name] != complete[name]]
+        == []
     )
     _, lines = lines_of(account)
     frames = lines["frames that the method does not use"]
-    assert (frames["done"], frames["left_out"]) == (6 * 22, 6 * 30) and frames["bytes_saved"] == 180 * PIXELS
+    assert (frames["done"], frames["left_out"]) == (6 * 22, 6 * 30) and frames[
+        "bytes_saved"
+    ] == 180 * PIXELS
     second_direction = lines["second direction where the first shows no object"]
     dataset = DatasetFolder(tiny)
     object_px = sum(row["object_px"] for row in dataset.manifest.samples["test"])
@@ -125,13 +147,28 @@ def test_predictions_scores_and_their_accounts(tiny, tmp_path):
     assert scores[0] == scores[1]
     _, lines = lines_of(account)
     columns = lines["columns that no score needs"]
-    assert (columns["done"], columns["left_out"]) == (6, 6 * 53) and columns["bytes_saved"] == 6 * PIXELS * (52 + 4)
+    assert (columns["done"], columns["left_out"]) == (6, 6 * 53) and columns[
+        "bytes_saved"
+    ] == 6 * PIXELS * (52 + 4)
     assert lines["depth edges far from the object"]["done"] > object_px
 
 
 def test_the_phase_route_is_counted_by_its_crop(tiny, tmp_path):
     account = tmp_path / "account.json"
-    assert main(["predict", "phase", str(tiny), "--out", str(tmp_path / "p"), "--explain-json", str(account)]) == 0
+    assert (
+        main(
+            [
+                "predict",
+                "phase",
+                str(tiny),
+                "--out",
+                str(tmp_path / "p"),
+                "--explain-json",
+                str(account),
+            ]
+        )
+        == 0
+    )
     _, lines = lines_of(account)
     line = lines["local fits and orders far from the object"]
     assert line["done"] + line["left_out"] == 6 * PIXELS and 0.1 < line["share"] < 0.95

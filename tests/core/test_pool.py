@@ -40,7 +40,10 @@ def test_a_cluster_gives_what_this_process_gives_and_takes_the_work_once(fake_ra
 
 
 def test_an_error_of_a_task_is_raised_as_it_is(fake_ray):
-    with pytest.raises(MeshError, match="does not fit"), mapping(Work(), cluster=fake_ray.address) as mapped:
+    with (
+        pytest.raises(MeshError, match="does not fit"),
+        mapping(Work(), cluster=fake_ray.address) as mapped,
+    ):
         list(mapped(half_of, [1, 1], [1, -1]))
     assert not fake_ray.open
 
@@ -63,30 +66,45 @@ if __name__ == "__main__":
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are killed by a signal")
 def test_no_worker_outlives_its_parent(tmp_path):
     (tmp_path / "waiting.py").write_text(_WAITING)
-    parent = subprocess.Popen([sys.executable, "waiting.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen(
+        [sys.executable, "waiting.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+    )
     for _ in range(2):
         assert int(parent.stdout.readline()) != parent.pid  # both are at work
     parent.kill()
-    assert parent.communicate(timeout=30)[0] == ""  # returns when the last worker has closed its end
+    assert (
+        parent.communicate(timeout=30)[0] == ""
+    )  # returns when the last worker has closed its end
 
 
 def test_a_task_that_dies_on_every_node_is_an_error_that_says_so(fake_ray):
     fake_ray.dies, finished = 2, []
     message = r"the cluster failed \(The worker died unexpectedly\); run the same command again"
-    with pytest.raises(PoolError, match=message), mapping(Work(), cluster=fake_ray.address) as mapped:
+    with (
+        pytest.raises(PoolError, match=message),
+        mapping(Work(), cluster=fake_ray.address) as mapped,
+    ):
         finished += mapped(half_of, [1, 1, 1], [1, 2, 3])
     assert not fake_ray.open
 
 
 def test_a_node_with_another_numpy_is_refused():
     sent = {**pool._versions(), "numpy": "1.0"}
-    with pytest.raises(PoolError, match=r"has numpy \S+ and not 1\.0: results may differ; install the same versions"):
+    with pytest.raises(
+        PoolError,
+        match=r"has numpy \S+ and not 1\.0: results may differ; install the same versions",
+    ):
         pool._run_task("run", sent, b"", half_of, 1, 2)
 
 
-@pytest.mark.parametrize("address", ["", "head", "ray://head", "http://head:80", "ray://:1", "ray://head:99999"])
+@pytest.mark.parametrize(
+    "address", ["", "head", "ray://head", "http://head:80", "ray://:1", "ray://head:99999"]
+)
 def test_what_is_no_address_is_said(fake_ray, address):
-    with pytest.raises(PoolError, match=r"expected ray://HOST:PORT"), mapping(Work(), cluster=address):
+    with (
+        pytest.raises(PoolError, match=r"expected ray://HOST:PORT"),
+        mapping(Work(), cluster=address),
+    ):
         pass
 
 

@@ -11,7 +11,9 @@ mpmath.mp.dps = 50
 
 
 def test_cosine_and_sine_within_two_units_in_the_last_place():
-    turns = np.concatenate([np.linspace(-2, 2, 4001), np.random.default_rng(0).uniform(-60, 60, 2000)])
+    turns = np.concatenate(
+        [np.linspace(-2, 2, 4001), np.random.default_rng(0).uniform(-60, 60, 2000)]
+    )
     for function, exact in ((cosine_of_turns, mpmath.cos), (sine_of_turns, mpmath.sin)):
         expected = np.array([float(exact(2 * mpmath.pi * mpmath.mpf(float(t)))) for t in turns])
         np.testing.assert_allclose(function(turns), expected, rtol=0, atol=2.0**-52)
@@ -27,11 +29,16 @@ def test_quarter_turns_are_exact():
 @pytest.mark.parametrize("exponent", [0.0, 0.4555, 1.0, 2.5, 10.0])
 def test_power(exponent):
     base = np.concatenate([10.0 ** np.linspace(-12, 0, 1001), np.linspace(0.4, 1, 501)])
-    expected = np.array([float(mpmath.power(mpmath.mpf(float(b)), mpmath.mpf(exponent))) for b in base])
-    # An error of one unit in exponent x log of the base, at most 280 here, is that much relative to the power.
+    expected = np.array(
+        [float(mpmath.power(mpmath.mpf(float(b)), mpmath.mpf(exponent))) for b in base]
+    )
+    # An error of one unit in exponent x log of the base, at most 280 here, is that much relative to
+    # the power.
     allowed = 4e-16 * np.maximum(1, exponent * np.abs(np.log(base)))
     assert (np.abs(power(base, exponent) - expected) <= allowed * expected).all()
-    assert power(np.array([0.0, 1.0]), exponent).tolist() == ([1.0, 1.0] if exponent == 0 else [0.0, 1.0])
+    assert power(np.array([0.0, 1.0]), exponent).tolist() == (
+        [1.0, 1.0] if exponent == 0 else [0.0, 1.0]
+    )
 
 
 def test_arctangent_of_two_arguments():
@@ -39,6 +46,9 @@ def test_arctangent_of_two_arguments():
     y, x = rng.normal(size=(2, 4000)) * 10.0 ** rng.integers(-8, 8, (2, 4000))
     y[:9], x[:9] = np.repeat([-1.0, 0.0, 1.0], 3), np.tile([-1.0, 0.0, 1.0], 3)
     expected = np.array(
-        [float(mpmath.atan2(mpmath.mpf(float(b)), mpmath.mpf(float(a)))) for a, b in zip(x, y, strict=True)]
+        [
+            float(mpmath.atan2(mpmath.mpf(float(b)), mpmath.mpf(float(a))))
+            for a, b in zip(x, y, strict=True)
+        ]
     )
     np.testing.assert_allclose(-minus_atan2(y, x), expected, rtol=4.5e-16, atol=0)

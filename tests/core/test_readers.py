@@ -1,4 +1,5 @@
-"""Every file from outside has one reader: what is mutated, hostile or no file at all ends in an error that names it."""
+"""Every file from outside has one reader: what is mutated, hostile or no file at all ends in an
+error that names it."""
 
 import json
 import os
@@ -16,9 +17,24 @@ from fpp_ml_bench.baselines.run import UNFINISHED_FILE, UnfinishedRun
 from fpp_ml_bench.baselines.training import weights as weights_files
 from fpp_ml_bench.baselines.training.weights import DEPTH_NETWORKS
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.errors import DatasetError, FppBenchError, LayoutError, RemoteError, RigError, SubmissionError
+from fpp_ml_bench.errors import (
+    DatasetError,
+    FppBenchError,
+    LayoutError,
+    RemoteError,
+    RigError,
+    SubmissionError,
+)
 from fpp_ml_bench.evaluation.result.file import read_result
-from fpp_ml_bench.files import DEEPEST, MOST_NODES, MOST_VALUES, path_problem, read_json, strict_json, strict_yaml
+from fpp_ml_bench.files import (
+    DEEPEST,
+    MOST_NODES,
+    MOST_VALUES,
+    path_problem,
+    read_json,
+    strict_json,
+    strict_yaml,
+)
 from fpp_ml_bench.loaders.captures.decoding import read_mask
 from fpp_ml_bench.loaders.published.importing import plan_import
 from fpp_ml_bench.loaders.storage.assembly import assemble, planned_receipt
@@ -44,15 +60,17 @@ def valid(tmp_path_factory):
 
 def test_all_sources_are_tested_and_valid(valid):
     assert set(valid) == {*YAML, *JSON, *CODED}
-    assert {name: source.outcome(source.text(source.content)) for name, source in valid.items()} == dict.fromkeys(
-        valid, "read"
-    )
+    assert {
+        name: source.outcome(source.text(source.content)) for name, source in valid.items()
+    } == dict.fromkeys(valid, "read")
 
 
 @pytest.mark.parametrize("name", YAML + JSON + CODED)
 def test_mutations_are_read_or_refused(name, valid):
     """Some of each, or the mutations would test nothing."""
-    count = 2 * MUTATIONS if name == "row" else MUTATIONS  # nearly every change of a row contradicts its other numbers
+    count = (
+        2 * MUTATIONS if name == "row" else MUTATIONS
+    )  # nearly every change of a row contradicts its other numbers
     outcomes = [valid[name].outcome(mutation) for mutation in valid[name].mutations(count, seed=0)]
     assert set(outcomes) == {"read", "refused"}
 
@@ -67,7 +85,8 @@ def test_changed_published_trees_are_read_or_refused(tmp_path):
 # ---- texts
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+    f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
 TEXTS = {
     "alias bomb": (BOMB, "uses an alias"),
@@ -78,7 +97,10 @@ TEXTS = {
     "own tag": ("%TAG ! tag:x,2000:\n--- !foo bar", "has the tag"),
     "exponent": ("name: 1e999999", "name: Infinity is no number"),
     "NaN": ("name: [1, .nan]", r"name\[1\]: NaN is no number"),
-    "digits": (f"name: {'9' * 10**5}", "name: a number of more than 1000 digits|at most 65536 bytes"),
+    "digits": (
+        f"name: {'9' * 10**5}",
+        "name: a number of more than 1000 digits|at most 65536 bytes",
+    ),
     "nested": ("[" * 10_000, "nested too deeply"),
     "nested by lines": ("- " * 10_000, "nested too deeply"),
     "large": ("#" * (1 << 20) + "\n", "expected at most"),
@@ -101,7 +123,8 @@ def refusal(source, content):
 
 
 @pytest.mark.parametrize(
-    ("name", "attack"), [*(("rig", attack) for attack in TEXTS), *((name, "key twice") for name in YAML[1:])]
+    ("name", "attack"),
+    [*(("rig", attack) for attack in TEXTS), *((name, "key twice") for name in YAML[1:])],
 )
 def test_hostile_yaml(name, attack, valid):
     """All attacks on one file, and one on each of the others: they have the same reader."""
@@ -141,7 +164,10 @@ JSON_TEXTS = {
 
 @pytest.mark.parametrize(
     ("name", "attack"),
-    [*(("rig as JSON", attack) for attack in JSON_TEXTS), *((name, "key twice") for name in JSON[1:])],
+    [
+        *(("rig as JSON", attack) for attack in JSON_TEXTS),
+        *((name, "key twice") for name in JSON[1:]),
+    ],
 )
 def test_hostile_json(name, attack, valid):
     """All attacks on one file, and one on each of the others: they have the same reader."""
@@ -151,20 +177,33 @@ def test_hostile_json(name, attack, valid):
 
 def test_json_is_read_as_it_is():
     content = {"a": [1, 2.5, -1e-320, None, True, "é\U0001f600 \n"], "": {}}
-    assert strict_json(json.dumps(content)) == strict_json(json.dumps(content, ensure_ascii=False)) == content
+    assert (
+        strict_json(json.dumps(content))
+        == strict_json(json.dumps(content, ensure_ascii=False))
+        == content
+    )
     assert strict_json("[" * DEEPEST + "]" * DEEPEST)
-    assert strict_json(f'["{"[{," * MOST_VALUES}"]') == ["[{," * MOST_VALUES]  # of a text nothing is counted
+    assert strict_json(f'["{"[{," * MOST_VALUES}"]') == [
+        "[{," * MOST_VALUES
+    ]  # of a text nothing is counted
 
 
 def test_a_result_of_too_many_objects_is_refused_before_anything_is_computed(valid, monkeypatch):
     """8,000 objects in 11 MB took 2 GB: the intervals are resampled over objects."""
-    monkeypatch.setattr("fpp_ml_bench.evaluation.result.model.intervals_over_objects", lambda *words: pytest.fail())
+    monkeypatch.setattr(
+        "fpp_ml_bench.evaluation.result.model.intervals_over_objects", lambda *words: pytest.fail()
+    )
     source = valid["result"]
     row = source.content["per_sample"][0]
-    for samples, objects, message in ((1001, 1001, "got 1001 and 1001"), (10_001, 2, "got 2 and 10001")):
+    for samples, objects, message in (
+        (1001, 1001, "got 1001 and 1001"),
+        (10_001, 2, "got 2 and 10001"),
+    ):
         rows = [{**row, "sample": f"s{i}", "object": f"o{i % objects}"} for i in range(samples)]
         content = {**source.content, "per_sample": rows}
-        assert f"at most 1000 objects and 10000 samples, {message}" in refusal(source, json.dumps(content))
+        assert f"at most 1000 objects and 10000 samples, {message}" in refusal(
+            source, json.dumps(content)
+        )
 
 
 # ---- files
@@ -215,7 +254,9 @@ def test_what_is_no_regular_file_is_refused_at_once(name, kind, valid, tmp_path,
     assert file.name in str(error.value) or str(file.parent) in str(error.value)
 
 
-def test_a_file_that_the_user_names_may_be_a_link_and_one_in_a_folder_of_predictions_not(valid, tmp_path):
+def test_a_file_that_the_user_names_may_be_a_link_and_one_in_a_folder_of_predictions_not(
+    valid, tmp_path
+):
     source = valid["rig"]
     source.file.write_bytes(source.text(source.content))
     (tmp_path / "link.yaml").symlink_to(source.file)
@@ -239,7 +280,10 @@ def test_files_are_bounded_before_they_are_read(tmp_path):
             read(tmp_path / name)
     with (tmp_path / "r.json").open("wb") as file:
         file.truncate((1 << 26) + 1)
-    with pytest.raises(SubmissionError, match=r"r\.json: has 67108865 bytes, expected at most 67108864 bytes; write"):
+    with pytest.raises(
+        SubmissionError,
+        match=r"r\.json: has 67108865 bytes, expected at most 67108864 bytes; write",
+    ):
         read_result(tmp_path / "r.json")
 
 
@@ -263,11 +307,17 @@ def first_shard(**changes):
 
 
 MANIFESTS = {
-    "sample is a path": (first_row(sample="../../x"), "sample '../../x': expected a name of letters"),
+    "sample is a path": (
+        first_row(sample="../../x"),
+        "sample '../../x': expected a name of letters",
+    ),
     "object is a path": (first_row(object="/etc/passwd"), "object '/etc/passwd': expected a name"),
     "view is a path": (first_row(view="../x"), "view '../x': expected a name"),
     "sample too long": (first_row(sample=300 * "a" + "_A0"), "expected a name"),
-    "no object": (lambda content: content["samples"]["test"][0].pop("object"), "object 'None': expected a name"),
+    "no object": (
+        lambda content: content["samples"]["test"][0].pop("object"),
+        "object 'None': expected a name",
+    ),
     "pixels are text": (first_row(object_px="many"), "object_px: expected a number, got many"),
     "error is a list": (first_row(gt_mae_mm=[]), "gt_mae_mm: expected a number"),
     "shard outside": (first_shard(path="../../etc/passwd"), "without . and .."),
@@ -276,22 +326,55 @@ MANIFESTS = {
     "no hash": (first_shard(xxh3_128="x"), "a hash of 32 hex digits"),
     "another key": (first_shard(x=1), "shards: expected exactly the keys path, split"),
     "shard of no group": (first_shard(group="x"), "unknown group 'x', expected data"),
-    "shard twice": (lambda content: content["shards"].append(content["shards"][0]), "is listed twice"),
-    "other file outside": (lambda content: content["others"][0].update(path="../x"), "without . and .."),
+    "shard twice": (
+        lambda content: content["shards"].append(content["shards"][0]),
+        "is listed twice",
+    ),
+    "other file outside": (
+        lambda content: content["others"][0].update(path="../x"),
+        "without . and ..",
+    ),
     "no split": (
         lambda content: content["samples"].update(holdout=content["samples"]["test"]),
         "unknown split 'holdout'",
     ),
-    "empty split": (lambda content: content["samples"].update(test=[]), "expected some in every split"),
-    "image of no size": (lambda content: content.update(size=[0, 16]), r"expected 1 to 16384 px a side"),
-    "image too large": (lambda content: content.update(size=[12, 16385]), r"expected 1 to 16384 px a side"),
-    "another rig": (lambda content: content["rig"]["camera"].update(fx="wide"), "camera.fx: expected a number"),
-    "stored nothing": (lambda content: content.update(stored="crossed"), "'crossed' is no configuration"),
+    "empty split": (
+        lambda content: content["samples"].update(test=[]),
+        "expected some in every split",
+    ),
+    "image of no size": (
+        lambda content: content.update(size=[0, 16]),
+        r"expected 1 to 16384 px a side",
+    ),
+    "image too large": (
+        lambda content: content.update(size=[12, 16385]),
+        r"expected 1 to 16384 px a side",
+    ),
+    "another rig": (
+        lambda content: content["rig"]["camera"].update(fx="wide"),
+        "camera.fx: expected a number",
+    ),
+    "stored nothing": (
+        lambda content: content.update(stored="crossed"),
+        "'crossed' is no configuration",
+    ),
     "exact is a number": (lambda content: content.update(exact=1), "exact: expected bool, got 1"),
-    "light is text": (lambda content: content["settings"].update(light="x"), "settings light: expected a mapping"),
-    "generator with an escape": (lambda content: content["generator"].update(name="\x1b[31m"), r"U\+001B"),
-    "another content": (lambda content: content["content"].update({"test/../x": "0" * 32}), "expected split/column"),
-    "content without hash": (lambda content: content["content"].update({"test/depth": "x"}), "a hash of 32 hex digits"),
+    "light is text": (
+        lambda content: content["settings"].update(light="x"),
+        "settings light: expected a mapping",
+    ),
+    "generator with an escape": (
+        lambda content: content["generator"].update(name="\x1b[31m"),
+        r"U\+001B",
+    ),
+    "another content": (
+        lambda content: content["content"].update({"test/../x": "0" * 32}),
+        "expected split/column",
+    ),
+    "content without hash": (
+        lambda content: content["content"].update({"test/depth": "x"}),
+        "a hash of 32 hex digits",
+    ),
     "more": (lambda content: content.update(more=1), "expected exactly the keys origin"),
 }
 
@@ -360,12 +443,18 @@ def test_a_mesh_that_the_manifest_does_not_list_is_not_exported(copied, tmp_path
     for name in ("bowl", "mug"):
         (copied / "meshes" / f"{name}.ply").symlink_to("/etc/passwd")
     assert main(["export", str(copied), "--out", str(tmp_path / "out"), "--meshes"]) == 2
-    assert "bowl.ply: the mesh is missing" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert (
+        "bowl.ply: the mesh is missing" in capsys.readouterr().err
+        and not (tmp_path / "out").exists()
+    )
 
 
 def test_rows_without_end_are_a_finding_at_once(copied):
     changed_manifest(copied, first_shard(rows=10**15))
-    assert any(f"the files hold {10**15} rows, expected each of 6 once" in finding for finding in verify(copied))
+    assert any(
+        f"the files hold {10**15} rows, expected each of 6 once" in finding
+        for finding in verify(copied)
+    )
 
 
 # ---- receipts, names from elsewhere
@@ -428,12 +517,16 @@ def test_damaged_lines_of_a_stopped_run_do_not_count(tmp_path):
         "[" * 10_000,
         '{"sample": "b", "seconds": NaN,',
     )
-    (tmp_path / UNFINISHED_FILE).write_text("\n".join([json.dumps(run), *bad, json.dumps(good)]) + "\n")
+    (tmp_path / UNFINISHED_FILE).write_text(
+        "\n".join([json.dumps(run), *bad, json.dumps(good)]) + "\n"
+    )
     assert UnfinishedRun(tmp_path, run).finished == {"a": (0.5, {})}
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(SubmissionError, match=r"none\.json: can't be read: No such file or directory$"):
+    with pytest.raises(
+        SubmissionError, match=r"none\.json: can't be read: No such file or directory$"
+    ):
         read_json(tmp_path / "none.json", SubmissionError)
     with pytest.raises(SubmissionError, match=r"can't be read: embedded null byte"):
         read_json(tmp_path / "a\0b", SubmissionError)

@@ -16,12 +16,17 @@ def remote():
 
 def test_an_argument_is_a_path_or_a_url():
     assert place("data/set") == Path("data/set")
-    assert place("s3://bucket/set/") == RemoteFolder("s3://bucket/set") and str(place("s3://b/s")) == "s3://b/s"
+    assert (
+        place("s3://bucket/set/") == RemoteFolder("s3://bucket/set")
+        and str(place("s3://b/s")) == "s3://b/s"
+    )
 
 
 @pytest.mark.parametrize("kind", ["memory", "file"])
 def test_files_go_and_come_whole(kind, tmp_path):
-    remote = RemoteFolder(f"memory://{uuid4().hex}" if kind == "memory" else (tmp_path / "there").as_uri())
+    remote = RemoteFolder(
+        f"memory://{uuid4().hex}" if kind == "memory" else (tmp_path / "there").as_uri()
+    )
     assert remote.sizes() == {} and not remote.has("a/b.bin")
     file = tmp_path / "file"
     for content in (b"first", b"second one"):
@@ -35,7 +40,9 @@ def test_files_go_and_come_whole(kind, tmp_path):
 
 
 def test_a_url_that_fails_is_named(tmp_path):
-    with pytest.raises(RemoteError, match=r"nosuch://bucket: can't be read \(Protocol not known: nosuch\)"):
+    with pytest.raises(
+        RemoteError, match=r"nosuch://bucket: can't be read \(Protocol not known: nosuch\)"
+    ):
         RemoteFolder("nosuch://bucket").sizes()
     file = tmp_path / "file"
     file.write_bytes(b"x")

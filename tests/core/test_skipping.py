@@ -29,7 +29,9 @@ def test_the_switch_is_the_environment_and_comes_back(monkeypatch):
     assert not skipping_enabled()
 
 
-SHADY = named_light("paper").changed("bounces", shadows=True, interreflection=False, ambient_occlusion=False)
+SHADY = named_light("paper").changed(
+    "bounces", shadows=True, interreflection=False, ambient_occlusion=False
+)
 SHADY = SHADY.changed("camera", rays_across=1)
 
 
@@ -58,7 +60,8 @@ def test_what_the_manifest_says_is_what_was_traced_and_exposed(tmp_path, monkeyp
     rows = manifest.samples["train"]
     pixels, traced = TINY_SIZE**2, counts["rays"]
     assert traced == sum(row["shadow_rays"] for row in rows) < 0.1 * len(rows) * pixels
-    # Frame 0 whole; it and 49 that only the ground truth needs at the object alone; black and white nowhere.
+    # Frame 0 whole; it and 49 that only the ground truth needs at the object alone; black and white
+    # nowhere.
     assert counts["exposed"] == sum(pixels + 50 * row["exact_px"] for row in rows)
     counts.update(rays=0, exposed=0)
     with skipping(False):
@@ -73,7 +76,8 @@ RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "tu
 
 
 def sparse(rig, share=0.3):
-    """Frames of a tilted plane that fills a band of the image, far background elsewhere, some of it dark."""
+    """Frames of a tilted plane that fills a band of the image, far background elsewhere, some of it
+    dark."""
     shape = rig.camera.height, rig.camera.width
     surface = tilted(rig)
     surface[int(share * shape[0]) :] = 3.2
@@ -107,7 +111,8 @@ def test_depth_alone_is_the_depth_with_reasons(rig, steps):
 
 @pytest.mark.parametrize("disagreement", [0.02, 1.5, 8.0])
 def test_no_pixel_near_the_ends_of_the_range_is_lost(disagreement):
-    """Planes at the very ends of the range, noise that moves pixels across them, and any tolerance."""
+    """Planes at the very ends of the range, noise that moves pixels across them, and any
+    tolerance."""
     near_mm, far_mm = PAPER.working_range_mm
     shape = PAPER.camera.height, PAPER.camera.width
     for depth_mm in (near_mm, far_mm):

@@ -1,4 +1,5 @@
-"""The style of the pictures: it is applied to our own alone, and the bytes are the same each time."""
+"""The style of the pictures: it is applied to our own alone, and the bytes are the same each
+time."""
 
 import io
 
@@ -38,18 +39,25 @@ def test_the_bytes_are_the_same_each_time_and_fewer_when_reduced():
 def test_a_legend_of_long_titles_is_in_the_picture():
     picture, (axes,) = panels(["one"], 1, 13, 2)
     for number in range(6):
-        axes.plot([0, 1], [0, number], label=f"{number}" + 4 * ", order by range and shading, nothing learned")
+        axes.plot(
+            [0, 1],
+            [0, number],
+            label=f"{number}" + 4 * ", order by range and shading, nothing learned",
+        )
     styled(with_legend)(picture, 3)
     legend, whole = picture.legends[0].get_window_extent(), picture.bbox
     assert whole.x0 <= legend.x0 and legend.x1 <= whole.x1
 
 
 def test_line_colours_differ_to_everyone():
-    """Every two differ in lightness or along the blue-yellow axis, which red-green blindness leaves."""
+    """Every two differ in lightness or along the blue-yellow axis, which red-green blindness
+    leaves."""
     rgb = np.array([to_rgb(colour) for colour in LINE_COLOURS])
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     # What is seen without the red-sensitive cones (Vienot, Brettel and Mollon, 1999).
-    seen = linear @ np.array([[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]]).T
+    seen = (
+        linear @ np.array([[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]]).T
+    )
     apart = np.abs(seen[:, None] ** (1 / 2.2) - seen[None] ** (1 / 2.2)).max(axis=-1)
     assert apart[~np.eye(len(rgb), dtype=bool)].min() > 0.08
 

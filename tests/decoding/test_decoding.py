@@ -32,10 +32,16 @@ def test_depth_error_is_the_noise_it_must_have(rig, direction):
     good = (np.abs(u - (rig.projector.width - 1) / 2) < (rig.projector.width - 1) / 2 - 2) & (
         np.abs(v - (rig.projector.height - 1) / 2) < (rig.projector.height - 1) / 2 - 2
     )
-    assert good.mean() > 0.8 and (decoded.reason[good] == Reason.DECODED).all() and decoded.depth_mm.dtype == np.float32
+    assert (
+        good.mean() > 0.8
+        and (decoded.reason[good] == Reason.DECODED).all()
+        and decoded.depth_mm.dtype == np.float32
+    )
     steps = rig.sequence.steps
     # Noise of one grey level and the variance of rounding, 1/12.
-    predicted = depth_noise_mm(rig, depth * 1000, direction, steps, MODULATION, np.sqrt(1 + 1 / 12), rig.camera.rays())
+    predicted = depth_noise_mm(
+        rig, depth * 1000, direction, steps, MODULATION, np.sqrt(1 + 1 / 12), rig.camera.rays()
+    )
     error = (decoded.depth_mm - depth * 1000)[good]
     assert np.abs(error).max() < 30  # an order wrong by 1 is 250 mm
     core = np.abs(error / predicted[good])
@@ -63,7 +69,10 @@ def test_gray_code_alone_answers_within_its_cells(code):
     u, v = rig.project(np.stack([x * depth, y * depth, depth], axis=-1))
     lit = (u > 2) & (u < rig.projector.width - 3) & (v > 2) & (v < rig.projector.height - 3)
     assert lit.mean() > 0.8 and (decoded.reason[lit] == Reason.DECODED).mean() >= 0.97
-    slopes = [coordinate_slope_px_per_mm(rig, depth * 1000, direction, rig.camera.rays()) for direction in DIRECTIONS]
+    slopes = [
+        coordinate_slope_px_per_mm(rig, depth * 1000, direction, rig.camera.rays())
+        for direction in DIRECTIONS
+    ]
     sigma_mm = code["cell_px"] / np.sqrt(12) / np.hypot(*slopes)
     answered = lit & (decoded.depth_mm > 0)
     ratio = (np.abs(decoded.depth_mm - depth * 1000) / sigma_mm)[answered]
@@ -76,19 +85,30 @@ def test_gray_code_alone_answers_within_its_cells(code):
 def test_frames_of_floats_decode_as_those_of_bytes(rig, direction):
     frames = capture(rig, tilted(rig), noise=3.0, albedo=0.9)
     for frame in frames[::3]:
-        frame[:20] = np.random.default_rng(1).integers(0, 256, frame[:20].shape, dtype=np.uint8)  # no signal at all
+        frame[:20] = np.random.default_rng(1).integers(
+            0, 256, frame[:20].shape, dtype=np.uint8
+        )  # no signal at all
     compiled = decode_stack(frames, rig, direction, details=True)
-    plain = decode_stack([frame.astype(np.float32) for frame in frames], rig, direction, details=True)
+    plain = decode_stack(
+        [frame.astype(np.float32) for frame in frames], rig, direction, details=True
+    )
     assert np.array_equal(compiled.reason, plain.reason) and compiled.counts == plain.counts
     assert len(np.unique(plain.reason)) >= 3
     # Both round a float64 depth once to float32: at most one unit in the last place apart.
     ulp = np.spacing(np.maximum(plain.depth_mm, np.float32(1)))
     assert (np.abs(compiled.depth_mm - plain.depth_mm) <= ulp).all()
     for name in compiled.details:
-        np.testing.assert_allclose(compiled.details[name].phase, plain.details[name].phase, atol=1e-12, rtol=0)
-        np.testing.assert_array_equal(compiled.details[name].modulation, plain.details[name].modulation)
         np.testing.assert_allclose(
-            compiled.details[name].coordinate_px, plain.details[name].coordinate_px, atol=1e-10, rtol=0
+            compiled.details[name].phase, plain.details[name].phase, atol=1e-12, rtol=0
+        )
+        np.testing.assert_array_equal(
+            compiled.details[name].modulation, plain.details[name].modulation
+        )
+        np.testing.assert_allclose(
+            compiled.details[name].coordinate_px,
+            plain.details[name].coordinate_px,
+            atol=1e-10,
+            rtol=0,
         )
 
 
@@ -107,7 +127,9 @@ def test_mask_threads_and_layout_change_no_bit():
     columns = [np.asfortranarray(frame) for frame in frames]
     for variant in (read_only, columns):
         again = decode_stack(variant, PAPER, threads=2)
-        assert np.array_equal(again.depth_mm, full.depth_mm) and np.array_equal(again.reason, full.reason)
+        assert np.array_equal(again.depth_mm, full.depth_mm) and np.array_equal(
+            again.reason, full.reason
+        )
     nothing = decode_stack(frames, PAPER, mask=np.zeros_like(mask))
     assert not nothing.depth_mm.any() and nothing.counts["not_asked"] == mask.size
 
@@ -129,7 +151,9 @@ def test_every_reason_is_given_where_it_holds():
 
     glaring = [np.minimum(frame * 4.0, 255).astype(np.uint8) for frame in frames]
     assert (reasons(glaring)[inside] == Reason.SATURATED).mean() > 0.95
-    assert (reasons(glaring, limits=Limits(max_clipped_steps=18))[inside] == Reason.DECODED).mean() > 0.9
+    assert (
+        reasons(glaring, limits=Limits(max_clipped_steps=18))[inside] == Reason.DECODED
+    ).mean() > 0.9
 
     flipped = [frame.copy() for frame in frames]
     sequence = PAPER.sequence
@@ -151,7 +175,10 @@ def test_every_reason_is_given_where_it_holds():
     assert (decoded.reason[inside] == Reason.OUTSIDE_RANGE).all() and not decoded.depth_mm.any()
 
     # A lens that folds 0.3 from the axis, and an image that reaches 0.35: the corners have no ray.
-    folded = replace(PAPER, camera=replace(PAPER.camera, fx=280.0, fy=280.0, distortion=(-1.8, 0.0, 0.0, 0.0, 0.0)))
+    folded = replace(
+        PAPER,
+        camera=replace(PAPER.camera, fx=280.0, fy=280.0, distortion=(-1.8, 0.0, 0.0, 0.0, 0.0)),
+    )
     no_ray = np.isnan(folded.camera.rays()[0])
     assert no_ray.any() and not no_ray.all()
     assert (reasons(frames, folded)[no_ray] == Reason.NO_RAY).all()
@@ -162,7 +189,8 @@ def test_a_coordinate_beyond_the_patterns_border_is_outside():
     rig = PAPER
     depth = tilted(rig)
     frames = capture(rig, depth, noise=0.0)
-    # A rig whose projector is 305 px narrower than the projected pattern: the last cells are outside.
+    # A rig whose projector is 305 px narrower than the projected pattern: the last cells are
+    # outside.
     narrow = replace(rig, projector=replace(rig.projector, width=rig.projector.width - 305))
     decoded = decode_stack(frames, narrow, "vertical", details=True)
     x, y = rig.camera.rays()
@@ -178,13 +206,19 @@ def test_every_cell_of_a_full_code_has_its_coordinate(bits):
     side = min(65536, 2**bits * 2)
     device = replace(PAPER.projector, width=side, height=side)
     rig = replace(
-        PAPER, projector=device, sequence=Sequence(3, bits, bits), pitch_vertical_px=4.0, pitch_horizontal_px=4.0
+        PAPER,
+        projector=device,
+        sequence=Sequence(3, bits, bits),
+        pitch_vertical_px=4.0,
+        pitch_horizontal_px=4.0,
     )
     exact_px = np.arange(2**bits) * 2 + 0.5
     levels = np.rint(direction_levels(rig, exact_px)).astype(np.uint8)
     decoded = plan_direction(rig, "vertical", 3).decode(levels, Limits())
     assert (decoded.reason == Reason.DECODED).all()
-    assert np.abs(decoded.coordinate_px - exact_px).max() < 0.01  # 4 px / 2 pi of half a grey level in 100
+    assert (
+        np.abs(decoded.coordinate_px - exact_px).max() < 0.01
+    )  # 4 px / 2 pi of half a grey level in 100
 
 
 @pytest.mark.parametrize("bit", range(7))
@@ -204,7 +238,9 @@ def test_frames_that_are_not_used_may_be_missing():
     again = decode_stack(needed, PAPER, "horizontal", steps=6)
     assert np.array_equal(again.depth_mm, full.depth_mm)
     assert full.frames_used == (0, 3, 6, 9, 12, 15, *range(36, 43))
-    with pytest.raises(DecodeError, match=r"frame 18: vertical sinusoid, step 0: expected an image, got None"):
+    with pytest.raises(
+        DecodeError, match=r"frame 18: vertical sinusoid, step 0: expected an image, got None"
+    ):
         decode_stack(needed, PAPER, "vertical", steps=6)
 
 
@@ -215,7 +251,11 @@ def test_frames_that_are_not_used_may_be_missing():
         (lambda f: [x[:, :-1] for x in f], {}, r"expected shape.*\(200, 200\).*got \(200, 199\)"),
         (lambda f: [x.astype(np.float64) for x in f], {}, "expected uint8.*float64"),
         (lambda f: [x.astype(np.float32) + 300 for x in f], {}, "float32 grey levels of 0 to 255"),
-        (lambda f: [*(x.astype(np.float32) for x in f[:9]), *f[9:]], {}, "dtype of the other frames"),
+        (
+            lambda f: [*(x.astype(np.float32) for x in f[:9]), *f[9:]],
+            {},
+            "dtype of the other frames",
+        ),
         (lambda f: f, {"direction": "diagonal"}, "horizontal, vertical or both"),
         (lambda f: f, {"steps": 2}, "3 to the 18"),
         (lambda f: f, {"threads": 0}, "threads"),
@@ -258,7 +298,9 @@ def test_a_black_frame_is_refused_by_name(steps, direction):
     frames, _ = plane_stack(rig)
     dead = rig.sequence.sinusoids(direction)[2]
     frames[dead] = np.zeros_like(frames[dead])
-    with pytest.raises(DecodeError, match=rf"frame {dead}: {direction} sinusoid, step 2.*capture failed"):
+    with pytest.raises(
+        DecodeError, match=rf"frame {dead}: {direction} sinusoid, step 2.*capture failed"
+    ):
         decode_stack(frames, rig, direction="both")
 
 

@@ -1,4 +1,5 @@
-"""The fewest frames that a rig's range needs: compared with closed forms; decoding with them gives the same bytes."""
+"""The fewest frames that a rig's range needs: compared with closed forms; decoding with them gives
+the same bytes."""
 
 from dataclasses import replace
 
@@ -18,7 +19,10 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 COARSE = replace(
-    PAPER, pitch_horizontal_px=36.0, pitch_vertical_px=40.0, sequence=replace(PAPER.sequence, steps=4)
+    PAPER,
+    pitch_horizontal_px=36.0,
+    pitch_vertical_px=40.0,
+    sequence=replace(PAPER.sequence, steps=4),
 )  # fewer cells than the code has words: its first bits never change
 
 
@@ -26,8 +30,13 @@ def fewest_gray_bits(rig, direction):
     """Gray bits that must be captured for a direction or ``both``, per direction."""
     if direction == "both" and orders_from_phases(rig).unambiguous:
         return {"horizontal": (), "vertical": ()}
-    levels = {name: gray_levels_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")}
-    return {name: tuple(bit for bit, level in enumerate(found) if level is None) for name, found in levels.items()}
+    levels = {
+        name: gray_levels_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")
+    }
+    return {
+        name: tuple(bit for bit, level in enumerate(found) if level is None)
+        for name, found in levels.items()
+    }
 
 
 def test_bits_that_are_constant_in_view_are_not_needed():
@@ -43,7 +52,11 @@ def test_bits_that_are_constant_in_view_are_not_needed():
         == tuple(range(7))
     )
     # In a tenth of the pattern fewer bits change.
-    narrow = replace(PAPER, camera=replace(PAPER.camera, fx=20_000.0, fy=20_000.0), working_range_mm=(1790.0, 1810.0))
+    narrow = replace(
+        PAPER,
+        camera=replace(PAPER.camera, fx=20_000.0, fy=20_000.0),
+        working_range_mm=(1790.0, 1810.0),
+    )
     assert (
         len(fewest_gray_bits(narrow, "vertical")["vertical"]) < 7
         and fewest_gray_bits(narrow, "vertical")["vertical"][-1] == 6
@@ -51,17 +64,27 @@ def test_bits_that_are_constant_in_view_are_not_needed():
 
 
 def test_two_phases_of_the_papers_rig_by_hand():
-    """Along a ray u moves by f b_x and v by f b_y per unit of inverse depth: 125 to 100 at every pixel."""
+    """Along a ray u moves by f b_x and v by f b_y per unit of inverse depth: 125 to 100 at every
+    pixel."""
     code = orders_from_phases(PAPER)
     eu, ev = np.array([125.0, -100.0]) / np.hypot(125, 100)
     pairs = [(i, j) for i in range(-3, 4) for j in range(-2, 3) if (i, j) != (0, 0)]
-    assert code.least_gap_px == pytest.approx(min(abs(18 * (i * ev - j * eu)) for i, j in pairs), rel=1e-9)
-    assert code.driver == "vertical" and code.most_periods == pytest.approx(PAPER.periods_in_range("vertical"))
-    assert code.unambiguous and fewest_gray_bits(PAPER, "both") == {"horizontal": (), "vertical": ()}
+    assert code.least_gap_px == pytest.approx(
+        min(abs(18 * (i * ev - j * eu)) for i, j in pairs), rel=1e-9
+    )
+    assert code.driver == "vertical" and code.most_periods == pytest.approx(
+        PAPER.periods_in_range("vertical")
+    )
+    assert code.unambiguous and fewest_gray_bits(PAPER, "both") == {
+        "horizontal": (),
+        "vertical": (),
+    }
     # Equal baselines and pitches: both phases are equal and don't determine the order.
     alike = replace(PAPER, translation_m=(0.1, -0.1, 0.0))
     assert orders_from_phases(alike).least_gap_px == pytest.approx(0, abs=1e-9)
-    assert fewest_gray_bits(alike, "both") == {name: fewest_gray_bits(alike, name)[name] for name in DIRECTIONS}
+    assert fewest_gray_bits(alike, "both") == {
+        name: fewest_gray_bits(alike, name)[name] for name in DIRECTIONS
+    }
     assert not orders_from_phases(LENSES).unambiguous
 
 
@@ -98,7 +121,9 @@ def test_depth_with_the_fewest_frames_is_the_same_bytes(rig, direction, gray):
 def test_a_pair_far_from_its_epipolar_line_is_refused_and_a_tight_limit_holds():
     frames = capture(PAPER, tilted(PAPER), noise=25.0)
     loose = decode_stack(frames, PAPER, steps=3, fewest=True)
-    tight = decode_stack(frames, PAPER, steps=3, fewest=True, limits=Limits(max_disagreement_px=0.1))
+    tight = decode_stack(
+        frames, PAPER, steps=3, fewest=True, limits=Limits(max_disagreement_px=0.1)
+    )
     assert 0 < (tight.depth_mm > 0).sum() < (loose.depth_mm > 0).sum()
     assert tight.counts["directions_disagree"] > loose.counts["directions_disagree"] > 0
 
@@ -108,7 +133,9 @@ def test_details_go_with_the_fewest_frames():
     fewest, every = (decode_stack(frames, PAPER, fewest=few, details=True) for few in (True, False))
     decoded = fewest.depth_mm > 0
     for name in DIRECTIONS:
-        of_fewest, of_every = (found.details[name].coordinate_px[decoded] for found in (fewest, every))
+        of_fewest, of_every = (
+            found.details[name].coordinate_px[decoded] for found in (fewest, every)
+        )
         np.testing.assert_array_equal(of_fewest, of_every)
 
 
@@ -123,22 +150,52 @@ def test_steps_follow_the_square_root_law():
 def test_predicting_with_the_fewest_frames(tiny, tmp_path, capsys):
     dataset = DatasetFolder(tiny)
     method = ClassicalMethod(dataset.rig, direction="both", steps=3, fewest=True)
-    assert len(method.frames_used) == 6 and method.title == "Classical 3-step, both directions, no Gray code"
+    assert (
+        len(method.frames_used) == 6
+        and method.title == "Classical 3-step, both directions, no Gray code"
+    )
     assert ClassicalMethod(paper_rig(TINY_SIZE), direction="vertical", fewest=True).frames_used == (
         *range(18, 36),
         *dataset.sequence.gray("vertical"),
     )
     for name, options in (("all", []), ("six", ["--fewest"])):
-        assert main(["predict", "classical", str(tiny), "--out", str(tmp_path / name), "--steps", "3", *options]) == 0
+        assert (
+            main(
+                [
+                    "predict",
+                    "classical",
+                    str(tiny),
+                    "--out",
+                    str(tmp_path / name),
+                    "--steps",
+                    "3",
+                    *options,
+                ]
+            )
+            == 0
+        )
     for sample in dataset.samples("test"):
         six, twenty = (np.load(tmp_path / name / f"{sample}.npy") for name in ("six", "all"))
         # A pixel of two surfaces, or of bounced light, has no one phase: there the two may differ.
         special = (dataset.flags(sample) & (VOID | Flag.INTERREFLECTION)) > 0
         np.testing.assert_array_equal(six[~special], twenty[~special])
         assert (six != twenty).sum() < 0.005 * six.size
-    command = ["predict", "classical", str(tiny), "--out", str(tmp_path / "noise"), "--depth-noise", "0.8", "--fewest"]
+    command = [
+        "predict",
+        "classical",
+        str(tiny),
+        "--out",
+        str(tmp_path / "noise"),
+        "--depth-noise",
+        "0.8",
+        "--fewest",
+    ]
     assert main(command) == 0
     assert "no Gray code" in capsys.readouterr().out
-    for wrong in (["--depth-noise", "0.001"], ["--depth-noise", "0.8", "--steps", "5"], ["--depth-noise", "-1"]):
+    for wrong in (
+        ["--depth-noise", "0.001"],
+        ["--depth-noise", "0.8", "--steps", "5"],
+        ["--depth-noise", "-1"],
+    ):
         assert main(["predict", "classical", str(tiny), "--out", str(tmp_path / "w"), *wrong]) == 2
         assert "--depth-noise" in capsys.readouterr().err

@@ -5,18 +5,26 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, depth_noise_mm
+from fpp_ml_bench.decoding.triangulation import (
+    depth_from_both,
+    depth_from_coordinate,
+    depth_noise_mm,
+)
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 from fpp_ml_bench.optics.sequence import Sequence
 
-CAMERA_LENS, PROJECTOR_LENS = (-0.18, 0.09, 0.001, -0.002, -0.01), (0.07, -0.05, -0.001, 0.0015, 0.02)
+CAMERA_LENS, PROJECTOR_LENS = (
+    (-0.18, 0.09, 0.001, -0.002, -0.01),
+    (0.07, -0.05, -0.001, 0.0015, 0.02),
+)
 
 
 def general_rig(camera_lens=(0.0,) * 5, projector_lens=(0.0,) * 5, size=40):
-    """A rotated rig with the projector 5 cm ahead of the camera, so that all elements of R and t matter."""
+    """A rotated rig with the projector 5 cm ahead of the camera, so that all elements of R and t
+    matter."""
     camera = Pinhole(size, size - 6, 2.3 * size, 2.2 * size, 0.52 * size, 0.45 * size, camera_lens)
     projector = Pinhole(400, 300, 700.0, 690.0, 190.3, 155.2, projector_lens)
     turn = rotation_matrix((0.05, -0.09, 0.12))
@@ -32,7 +40,8 @@ RIGS = {
 
 
 def scene(rig, seed=0):
-    """Random depths in the working range: rays (x, y), depth in mm, and the exact projector coordinates."""
+    """Random depths in the working range: rays (x, y), depth in mm, and the exact projector
+    coordinates."""
     x, y = rig.camera.rays()
     depth = np.random.default_rng(seed).uniform(1.5, 2.1, x.shape)
     u, v = rig.project(np.stack([x * depth, y * depth, depth], axis=-1))
@@ -42,8 +51,12 @@ def scene(rig, seed=0):
 @pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
 def test_exact_coordinates_give_exact_depth(rig):
     rays, depth_mm, u, v = scene(rig)
-    np.testing.assert_allclose(depth_from_coordinate(rays, u, rig, "vertical"), depth_mm, atol=1e-6, rtol=0)
-    np.testing.assert_allclose(depth_from_coordinate(rays, v, rig, "horizontal"), depth_mm, atol=1e-6, rtol=0)
+    np.testing.assert_allclose(
+        depth_from_coordinate(rays, u, rig, "vertical"), depth_mm, atol=1e-6, rtol=0
+    )
+    np.testing.assert_allclose(
+        depth_from_coordinate(rays, v, rig, "horizontal"), depth_mm, atol=1e-6, rtol=0
+    )
     from_both = depth_from_both(rays, u, v, rig, 0.3, 1.7)
     np.testing.assert_allclose(from_both.depth_mm, depth_mm, atol=1e-6, rtol=0)
     assert from_both.disagreement_px.max() < 1e-7
@@ -91,7 +104,9 @@ def test_disagreement_is_the_distance_from_opencvs_epipolar_line():
     device = rig.projector
     inverse = np.linalg.inv([[device.fx, 0, device.cx], [0, device.fy, device.cy], [0, 0, 1]])
     camera_points = np.stack([rays[0].ravel(), rays[1].ravel()], axis=-1).reshape(-1, 1, 2)
-    a, b, c = cv2.computeCorrespondEpilines(camera_points, 1, inverse.T @ essential)[:, 0].T  # (a, b) has length 1
+    a, b, c = cv2.computeCorrespondEpilines(camera_points, 1, inverse.T @ essential)[
+        :, 0
+    ].T  # (a, b) has length 1
     expected = np.abs(a * u.ravel() + b * v.ravel() + c).reshape(u.shape)
     for weights in [(1.0, 1.0), (0.2, 3.0)]:
         disagreement_px = depth_from_both(rays, u, v, rig, *weights).disagreement_px
@@ -101,15 +116,22 @@ def test_disagreement_is_the_distance_from_opencvs_epipolar_line():
 def test_pixels_without_depth_are_nan():
     rig = paper_rig(40)
     rays = np.zeros(5), np.zeros(5)
-    # Straight ahead: the far point u = cx is parallel, beyond it the intersection lies behind the camera.
-    u = np.array([rig.projector.cx, rig.projector.cx - 60, np.nan, np.inf, 455.5 + 1824 * 0.125 / 1.8])
+    # Straight ahead: the far point u = cx is parallel, beyond it the intersection lies behind the
+    # camera.
+    u = np.array(
+        [rig.projector.cx, rig.projector.cx - 60, np.nan, np.inf, 455.5 + 1824 * 0.125 / 1.8]
+    )
     depth_mm = depth_from_coordinate(rays, u, rig, "vertical")
     assert np.isnan(depth_mm).tolist() == [True, True, True, True, False]
     assert depth_mm[4] == pytest.approx(1800)
     from_both = depth_from_both(rays, u, np.full(5, 569.5 - 1824 * 0.1 / 1.8), rig)
-    assert np.isnan(from_both.depth_mm[[2, 3]]).all() and from_both.depth_mm[4] == pytest.approx(1800)
+    assert np.isnan(from_both.depth_mm[[2, 3]]).all() and from_both.depth_mm[4] == pytest.approx(
+        1800
+    )
     missing = np.array([np.nan])
-    assert np.isnan(depth_from_coordinate((missing, np.zeros(1)), np.array([500.0]), rig, "vertical")).all()
+    assert np.isnan(
+        depth_from_coordinate((missing, np.zeros(1)), np.array([500.0]), rig, "vertical")
+    ).all()
 
 
 def test_a_point_behind_the_projector_has_no_depth():
@@ -118,7 +140,9 @@ def test_a_point_behind_the_projector_has_no_depth():
     rig = Rig(paper_rig(40).camera, device, np.eye(3), (0.125, -0.1, -1.0))
     point = np.array([0.0, 0.0, 0.5]) + rig.t
     mirrored = device.fx * point[0] / point[2] + device.cx
-    assert np.isnan(depth_from_coordinate((np.zeros(1), np.zeros(1)), np.array([mirrored]), rig, "vertical")).all()
+    assert np.isnan(
+        depth_from_coordinate((np.zeros(1), np.zeros(1)), np.array([mirrored]), rig, "vertical")
+    ).all()
 
 
 def test_a_direction_along_the_baseline_measures_nothing():
@@ -140,7 +164,9 @@ def test_projector_distortion_beyond_inversion_is_nan():
 
 def test_depth_noise_of_the_paper_rig_is_the_written_formula():
     expected = 18 / (2 * np.pi) * np.sqrt(2 / 18) / 60 * 1.8**2 / (1824 * 0.125) * 1000
-    assert depth_noise_mm(paper_rig(), 1800.0, "vertical", 18, 60.0) == pytest.approx(expected, rel=1e-12)
+    assert depth_noise_mm(paper_rig(), 1800.0, "vertical", 18, 60.0) == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 def test_unknown_directions_and_steps_are_refused():

@@ -1,4 +1,5 @@
-"""``fpp-bench patterns --design``: the table, the rig file and the picture it writes, and what it refuses."""
+"""``fpp-bench patterns --design``: the table, the rig file and the picture it writes, and what it
+refuses."""
 
 import pytest
 
@@ -13,14 +14,31 @@ def call(*arguments):
 
 def test_a_rig_gets_the_proposed_pair(tmp_path, capsys):
     written, picture = tmp_path / "crossed.yaml", tmp_path / "design.png"
-    assert call("paper", "--pitches", "9-20", "--pair", "18,14", "--out", written, "--picture", picture) == 0
+    assert (
+        call(
+            "paper", "--pitches", "9-20", "--pair", "18,14", "--out", written, "--picture", picture
+        )
+        == 0
+    )
     said = capsys.readouterr().out
-    assert "39 degrees runs along the epipolar lines" in said and "asked for" in said and "its pair" in said
-    assert "18 / 14" in said and "0.71" in said and "0.98" in said and picture.read_bytes().startswith(b"\x89PNG")
+    assert (
+        "39 degrees runs along the epipolar lines" in said
+        and "asked for" in said
+        and "its pair" in said
+    )
+    assert (
+        "18 / 14" in said
+        and "0.71" in said
+        and "0.98" in said
+        and picture.read_bytes().startswith(b"\x89PNG")
+    )
     rig = load_rig(written)
     assert len(rig.crossed) == 3 and len(rig.sequence) == 55
     (first, second), (first_deg, second_deg) = rig.crossed.pitches_px, rig.crossed.angles_deg
-    assert f"proposed        {first:g} / {second:g} px at {first_deg:g} / {second_deg:g} degrees" in said
+    assert (
+        f"proposed        {first:g} / {second:g} px at {first_deg:g} / {second_deg:g} degrees"
+        in said
+    )
     assert call(written) == 0
     assert "its crossed" in capsys.readouterr().out
 
@@ -33,8 +51,13 @@ def test_a_rig_of_one_direction_keeps_its_code(tmp_path, capsys):
     written = tmp_path / "crossed.yaml"
     assert call(tmp_path / "rig.yaml", "--pair", "30,30", "--out", written) == 0
     said = capsys.readouterr().out
-    assert "a carrier at 0 degrees runs along" in said and "the carrier of 30 px at 0 degrees tells no depth" in said
-    assert load_rig(written).sequence.order == ("crossed", "vertical") and load_rig(written).directions == ("vertical",)
+    assert (
+        "a carrier at 0 degrees runs along" in said
+        and "the carrier of 30 px at 0 degrees tells no depth" in said
+    )
+    assert load_rig(written).sequence.order == ("crossed", "vertical") and load_rig(
+        written
+    ).directions == ("vertical",)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""Rivals on the torus: against all pairs of depths of all pixels, and the figures of pairs on rigs of several kinds."""
+"""Rivals on the torus: against all pairs of depths of all pixels, and the figures of pairs on rigs
+of several kinds."""
 
 from dataclasses import replace
 
@@ -6,7 +7,12 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.design.rivals import EpipolarLines, background_distance, rival_distance, wrong_orders
+from fpp_ml_bench.design.rivals import (
+    EpipolarLines,
+    background_distance,
+    rival_distance,
+    wrong_orders,
+)
 from fpp_ml_bench.design.search import Assumptions, describe, search, square_pair
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.named_rigs import CROSSED, paper_rig
@@ -17,14 +23,17 @@ TURNED = replace(
     rotation=((0.98, 0.0, 0.198997487421324), (0.0, 1.0, 0.0), (-0.198997487421324, 0.0, 0.98)),
     translation_m=(-0.25, -0.12, 0.06),
 )
-"""Looks to the side, with the projector in front of the camera: lines of all directions and lengths."""
+"""Looks to the side, with the projector in front of the camera: lines of all directions and
+lengths."""
 SIDEWAYS = replace(PAPER, translation_m=(0.16, 0.0, 0.0))
 
 
 def brute_force(rig, crossed, samples=500):
-    """Least distance of the phases of two depths of a pixel of the image's grid whose orders differ, and of the
-    background from any depth, rad."""
-    columns, rows = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(0, rig.camera.width - 1, 5)]))
+    """Least distance of the phases of two depths of a pixel of the image's grid whose orders
+    differ, and of the background from any depth, rad."""
+    columns, rows = (
+        axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(0, rig.camera.width - 1, 5)])
+    )
     near_m, far_m = (limit / 1000 for limit in rig.working_range_mm)
     depths_m = 1 / np.linspace(1 / near_m, 1 / far_m, samples)
     rival, background = np.inf, np.inf
@@ -35,7 +44,9 @@ def brute_force(rig, crossed, samples=500):
             continue
         behind = rig.project(rig.background_m * np.array([x, y, 1.0]))
         phases = np.stack([f_u * u + f_v * v for f_u, f_v in crossed.cycles_per_px], axis=1)
-        of_plane = np.array([f_u * behind[0] + f_v * behind[1] for f_u, f_v in crossed.cycles_per_px])
+        of_plane = np.array(
+            [f_u * behind[0] + f_v * behind[1] for f_u, f_v in crossed.cycles_per_px]
+        )
         apart = phases[:, None] - phases
         order = np.rint(apart)
         distance = 2 * np.pi * np.hypot(*np.moveaxis(apart - order, -1, 0))
@@ -60,16 +71,25 @@ def test_distances_are_those_of_all_pairs_of_depths(rig, crossed):
     turns = lines.turns(crossed)
     rival, background = brute_force(rig, crossed)
     assert float(rival_distance(turns).min()) == pytest.approx(min(rival, 7), abs=0.05)
-    assert float(background_distance(turns, lines.background).min()) == pytest.approx(background, abs=0.05)
+    assert float(background_distance(turns, lines.background).min()) == pytest.approx(
+        background, abs=0.05
+    )
     candidate = describe(rig, [crossed], Assumptions())[0]
     assert candidate.rival_rad == rival_distance(turns).min()
     assert candidate.background_rad == background_distance(turns, lines.background).min()
 
 
 def test_the_expected_errors_are_about_those_measured():
-    """Measured by `benchmarks/crossed_sweep.py` on 15 validation views, the mean of both lights, with the right mask:
-    share of wrong orders before neighbours help, and mean error in mm."""
-    measured = {6: (5.0, 2.22), 8: (2.9, 2.35), 10: (1.7, 2.30), 12: (1.4, 2.87), 14: (1.3, 3.70), 18: (0.9, 4.52)}
+    """Measured by `benchmarks/crossed_sweep.py` on 15 validation views, the mean of both lights,
+    with the right mask: share of wrong orders before neighbours help, and mean error in mm."""
+    measured = {
+        6: (5.0, 2.22),
+        8: (2.9, 2.35),
+        10: (1.7, 2.30),
+        12: (1.4, 2.87),
+        14: (1.3, 3.70),
+        18: (0.9, 4.52),
+    }
     lines = EpipolarLines.of(PAPER)
     found = describe(PAPER, [square_pair(lines, pitch) for pitch in measured], Assumptions())
     for candidate, (wrong_percent, mean_mm) in zip(found, measured.values(), strict=True):
@@ -99,7 +119,9 @@ def test_wrong_orders_of_drawn_errors():
 def test_a_carrier_along_the_epipolar_lines_tells_no_depth():
     lines = EpipolarLines.of(SIDEWAYS)
     assert lines.flat_angle_deg == pytest.approx(0, abs=1e-6)
-    straight, tilted = describe(SIDEWAYS, [Crossed((18.0, 18.0)), Crossed((18.0, 14.0), (45.0, 120.0))], Assumptions())
+    straight, tilted = describe(
+        SIDEWAYS, [Crossed((18.0, 18.0)), Crossed((18.0, 14.0), (45.0, 120.0))], Assumptions()
+    )
     assert straight.flat == (0,) and straight.rival_rad < 1e-9 and tilted.flat == ()
     found = search(SIDEWAYS, Assumptions(), (12.0, 18.0))
     assert found.proposed.rival_rad > 0.9 and found.proposed.flat == ()
@@ -108,7 +130,9 @@ def test_a_carrier_along_the_epipolar_lines_tells_no_depth():
 def test_noise_alone_is_that_of_drawn_noise():
     """Of both phases together, by least squares along the line at the far end."""
     crossed, assumed = Crossed((18.0, 14.0)), Assumptions(phase_error=1e-6)
-    slopes = 2 * np.pi * EpipolarLines.of(PAPER).far_px_per_mm[0] @ np.array(crossed.cycles_per_px).T
+    slopes = (
+        2 * np.pi * EpipolarLines.of(PAPER).far_px_per_mm[0] @ np.array(crossed.cycles_per_px).T
+    )
     rows, columns = np.mgrid[-40:41, -40:41]
     (found,) = describe(PAPER, [crossed], replace(assumed, surfaces_mm=(2099.999, 2100.0)))
     window = np.exp(-(rows**2 + columns**2) / (2 * (0.27 * max(found.image_px)) ** 2))
@@ -134,8 +158,13 @@ def test_the_search_proposes_the_least_expected_error(rig):
     for candidate in found.searched:
         assert all(6 <= seen <= 40 for seen in candidate.image_px)
         assert candidate.expected_mm == candidate.phase_mm + candidate.wrong_mm
-        assert max(candidate.turns) == pytest.approx(candidate.turns[0]) and candidate.turns[1] < 1.5
-    phases, orders = (np.array([getattr(one, f"{name}_mm") for one in found.searched]) for name in ("phase", "wrong"))
+        assert (
+            max(candidate.turns) == pytest.approx(candidate.turns[0]) and candidate.turns[1] < 1.5
+        )
+    phases, orders = (
+        np.array([getattr(one, f"{name}_mm") for one in found.searched])
+        for name in ("phase", "wrong")
+    )
     assert phases[0] < phases[-1] and orders[0] > orders[-1]
     blurred = search(rig, Assumptions(blur_px=2.0)).proposed
     assert blurred.crossed.pitches_px[0] > found.proposed.crossed.pitches_px[0]
@@ -150,6 +179,8 @@ def test_the_finer_crossed_rigs_have_farther_rivals_and_less_error_but_a_wall_th
 
 
 def test_a_projector_that_looks_away_is_refused():
-    away = replace(PAPER, rotation=((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)), background_m=None)
+    away = replace(
+        PAPER, rotation=((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)), background_m=None
+    )
     with pytest.raises(RigError, match="no pixel sees the pattern"):
         EpipolarLines.of(away)

@@ -1,4 +1,5 @@
-"""``fpp-bench diagnose``: reports that are whole, probes that are not run twice, models that can't be looked into."""
+"""``fpp-bench diagnose``: reports that are whole, probes that are not run twice, models that can't
+be looked into."""
 
 import json
 import re
@@ -99,9 +100,21 @@ def call(*arguments):
 # ---- the command
 
 
-def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, module_file, tmp_path, capsys, monkeypatch):
+def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(
+    tiny, module_file, tmp_path, capsys, monkeypatch
+):
     out = tmp_path / "report"
-    arguments = (f"{module_file}:make", tiny, "--out", out, "--layers", "encoder,decoder", "--quick", "--samples", 4)
+    arguments = (
+        f"{module_file}:make",
+        tiny,
+        "--out",
+        out,
+        "--layers",
+        "encoder,decoder",
+        "--quick",
+        "--samples",
+        4,
+    )
     assert call(*arguments, "--probe", "linear", "--threads", 1) == 0
     assert call(*arguments, "--probe", "grad-cam", "--threads", 1) == 0
     printed = capsys.readouterr().out
@@ -116,7 +129,9 @@ def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, modul
     assert set(values["linear"]["untrained"]["encoder"]) == targets
     assert set(values["four_convolutions"]["controls"]) == {"input", "silhouette"}
     layer = values["four_convolutions"]["trained"]["encoder"]
-    assert layer["edges"]["r2"] == pytest.approx(1 - layer["edges"]["mse"] / layer["edges"]["mse_of_mean"])
+    assert layer["edges"]["r2"] == pytest.approx(
+        1 - layer["edges"]["mse"] / layer["edges"]["mse_of_mean"]
+    )
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") == 2 and "encoder" in page
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
@@ -135,7 +150,9 @@ def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tm
     out = tmp_path / "report"
     assert call("classical", tiny, "--out", out, "--probe", "linear", "--probe", "grad-cam") == 0
     content = json.loads((out / "diagnose.json").read_text())
-    assert all("without a network" in finding["skipped"] for finding in content["findings"].values())
+    assert all(
+        "without a network" in finding["skipped"] for finding in content["findings"].values()
+    )
     assert "Not run: classical is a method without a network" in (out / "index.html").read_text()
 
 
@@ -162,13 +179,21 @@ def test_a_network_that_predicts_nothing_gets_a_sentence_and_no_ratio(
     assert "R2" not in capsys.readouterr().out
 
 
-def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tiny, module_file, tmp_path):
+def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(
+    tiny, module_file, tmp_path
+):
     out = tmp_path / "report"
-    model, probes = f"{module_file}:beside_a_dead_layer", ("--probe", "linear", "--probe", "grad-cam", "--quick")
+    model, probes = (
+        f"{module_file}:beside_a_dead_layer",
+        ("--probe", "linear", "--probe", "grad-cam", "--quick"),
+    )
     assert call(model, tiny, "--out", out, "--layers", "decoder", "--samples", 4, *probes) == 0
     findings = json.loads((out / "diagnose.json").read_text())["findings"]
     assert "every probed layer of my_net (decoder) is constant" in findings["linear"]["skipped"]
-    assert "the heatmaps of every layer of my_net (decoder) are constant" in findings["grad-cam"]["skipped"]
+    assert (
+        "the heatmaps of every layer of my_net (decoder) are constant"
+        in findings["grad-cam"]["skipped"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,10 +201,19 @@ def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tin
     [
         ("MINE:make", ("--probe", "gradcam"), "--probe gradcam: did you mean 'grad-cam'"),
         ("MINE:make", ("--layers", "encodr"), "has no layer 'encodr'; there are encoder"),
-        ("MINE:make", ("--layers", "unused", "--probe", "linear"), "'unused' takes no part in a forward pass"),
+        (
+            "MINE:make",
+            ("--layers", "unused", "--probe", "linear"),
+            "'unused' takes no part in a forward pass",
+        ),
         ("MINE:make", ("--frame", "99"), "expected 0 to 51"),
         ("MINE:nothing", (), "has no 'nothing'"),
-        ("MINE:shape", (), "expected an output of shape (1, 1, 176, 176), one depth per pixel, got (1, 1, 88, 176)"),
+        (
+            "MINE:shape",
+            (),
+            "expected an output of shape (1, 1, 176, 176), one depth per pixel, got (1, 1, 88, "
+            "176)",
+        ),
         ("MINE:nan", (), "30976 of 30976 values of its output are NaN"),
         ("MINE:several", (), "got tuple"),
         ("MINE:fails", (), "on fringes of shape (1, 1, 176, 176) it failed"),
@@ -189,7 +223,9 @@ def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tin
         ("phase", ("--units", "mm"), "its units are known"),
     ],
 )
-def test_what_cannot_be_looked_into_is_refused_with_a_reason(tiny, module_file, tmp_path, capsys, model, options, says):
+def test_what_cannot_be_looked_into_is_refused_with_a_reason(
+    tiny, module_file, tmp_path, capsys, model, options, says
+):
     model = model.replace("MINE", str(module_file))
     assert call(model, tiny, "--out", tmp_path / "report", *options) == 2
     printed = capsys.readouterr().err
@@ -197,7 +233,9 @@ def test_what_cannot_be_looked_into_is_refused_with_a_reason(tiny, module_file, 
     assert not (tmp_path / "report" / "index.html").exists()
 
 
-def test_a_folder_with_something_else_in_it_is_not_written_into(tiny, module_file, tmp_path, capsys):
+def test_a_folder_with_something_else_in_it_is_not_written_into(
+    tiny, module_file, tmp_path, capsys
+):
     (tmp_path / "thesis.tex").write_text("x")
     assert call("classical", tiny, "--out", tmp_path) == 2
     assert "holds thesis.tex" in capsys.readouterr().err
@@ -230,7 +268,14 @@ def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_pat
     classical, phase = subject("classical", opened), subject("phase", opened)
 
     def ask(model, settings):
-        probe.diagnose(model, opened, ["linear"], settings, tmp_path / "out", lambda probe: lambda *progress: None)
+        probe.diagnose(
+            model,
+            opened,
+            ["linear"],
+            settings,
+            tmp_path / "out",
+            lambda probe: lambda *progress: None,
+        )
         return counted.runs
 
     assert ask(classical, ProbeSettings()) == 1
@@ -239,7 +284,9 @@ def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_pat
     assert ask(phase, ProbeSettings(seeds=3)) == 3
     with pytest.raises(KeyboardInterrupt):
         ask(phase, ProbeSettings(samples=13))
-    assert ask(phase, ProbeSettings(seeds=3)) == 4  # what the stopped run did not replace is still there
+    assert (
+        ask(phase, ProbeSettings(seeds=3)) == 4
+    )  # what the stopped run did not replace is still there
     counted.version = 2
     assert ask(phase, ProbeSettings(seeds=3)) == 5
 
@@ -256,7 +303,10 @@ def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
     assert seconds == 1.25 and stored.values == finding.values and stored.figure == finding.figure
     assert (str(stored.table.title), stored.table.titles) == ("T", ["x", "y"])
     assert stored.table.texts == [("a", "1.5"), ("b", "-")]
-    assert load_finding(tmp_path, "linear", "other") is None and load_finding(tmp_path, "absent", "key") is None
+    assert (
+        load_finding(tmp_path, "linear", "other") is None
+        and load_finding(tmp_path, "absent", "key") is None
+    )
     (tmp_path / "linear.png").unlink()
     assert load_finding(tmp_path, "linear", "key") is None
     (tmp_path / "linear.json").write_text('{"key": "key"')
@@ -267,7 +317,13 @@ def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
 
 def test_text_of_a_finding_can_only_be_text(tmp_path):
     context = {
-        "subject": {"name": "<b>x</b>", "title": "t", "frames_used": [0], "direction": "both", "layers": []},
+        "subject": {
+            "name": "<b>x</b>",
+            "title": "t",
+            "frames_used": [0],
+            "direction": "both",
+            "layers": [],
+        },
         "dataset": {"name": "d", "fingerprint": "0" * 64, "size": [4, 4], "samples": {"test": 1}},
         "settings": {"samples": None},
         "software": {},
@@ -277,7 +333,9 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
     table = table_of("<u>", "<u>", {"<script>": {"<u>2": 0.123456}, "b": {}}, {"<u>2": "<u>2"})
     counted = Counted()
     counted.title, counted.question = "<t>", "<q>?"
-    page = probe.report_page(context, [ProbeResult(counted, Finding("<s>", table=table), 1.0, False)]).decode()
+    page = probe.report_page(
+        context, [ProbeResult(counted, Finding("<s>", table=table), 1.0, False)]
+    ).decode()
     for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):
         assert tag not in page
     assert "0.1235" in page
@@ -292,13 +350,16 @@ def test_samples_evenly():
 
 
 def float32_tolerance(network, values):
-    """How far the float32 output of ``network`` may be from ``values``, its exact output, on any processor.
+    """How far the float32 output of ``network`` may be from ``values``, its exact output, on any
+    processor.
 
-    Processors add the products of a convolution in different orders: n terms are off by n u at most, relative to the
-    sum of their magnitudes. Normalisation keeps the maps between convolutions at one scale, so the errors of the
-    convolutions in a row add up, relative to the largest output.
+    Processors add the products of a convolution in different orders: n terms are off by n u at
+    most, relative to the sum of their magnitudes. Normalisation keeps the maps between convolutions
+    at one scale, so the errors of the convolutions in a row add up, relative to the largest output.
     """
-    sums = [layer.weight[0].numel() for layer in network.modules() if isinstance(layer, torch.nn.Conv2d)]
+    sums = [
+        layer.weight[0].numel() for layer in network.modules() if isinstance(layer, torch.nn.Conv2d)
+    ]
     return float(len(sums) * max(sums) * U32 * np.abs(values).max())
 
 
@@ -306,7 +367,9 @@ def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_pa
     network = tiny_network("unet", width=4, seed=3)
     path = tmp_path / "net.safetensors"
     save_weights(
-        path, network, config_of(network, image_size=opened.size, normalisation="raw", background_removed=True)
+        path,
+        network,
+        config_of(network, image_size=opened.size, normalisation="raw", background_removed=True),
     )
     weights_subject = subject(str(path), opened)
     sample = opened.samples("test")[0]
@@ -324,19 +387,28 @@ def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_pa
     )
     assert not frames[0][~inside].any() and frames[0][inside].any() and frames[1] is None
     with torch.inference_mode():
-        expected = deepcopy(network).double()(weights_subject.input_batch([frames]).double())[0, 0].numpy()
+        expected = (
+            deepcopy(network).double()(weights_subject.input_batch([frames]).double())[0, 0].numpy()
+        )
     tolerance = float32_tolerance(network, expected)
     with torch.inference_mode():
         changed = deepcopy(network)
         changed.head.weight.mul_(1.01)  # a layer that is wrong by 1% must show
-        assert np.abs(changed(weights_subject.input_batch([frames]))[0, 0].numpy() - expected).max() > 4 * tolerance
+        assert (
+            np.abs(changed(weights_subject.input_batch([frames]))[0, 0].numpy() - expected).max()
+            > 4 * tolerance
+        )
     assert weights_subject.predict(frames) == pytest.approx(expected, abs=tolerance)
     same_seed, other_seed = weights_subject.untrained(3), weights_subject.untrained(4)
-    assert torch.equal(next(same_seed.parameters()), next(network.parameters()))  # seed 3 is what made the network
+    assert torch.equal(
+        next(same_seed.parameters()), next(network.parameters())
+    )  # seed 3 is what made the network
     assert not torch.equal(next(other_seed.parameters()), next(same_seed.parameters()))
     assert list(weights_subject.layers_of(other_seed)) == list(weights_subject.layer_names)
     two_layers = subject(str(path), opened, layers=["dec1", "enc1"])
-    assert two_layers.layer_names == ("enc1", "dec1") and two_layers.sha256 == weights_subject.sha256
+    assert (
+        two_layers.layer_names == ("enc1", "dec1") and two_layers.sha256 == weights_subject.sha256
+    )
     with pytest.raises(DiagnosisError, match="no network"):
         subject("classical", opened).networks()
 
@@ -356,4 +428,6 @@ def test_units_of_a_users_module_turn_its_output_into_mm(opened, module_file):
         subject(f"{module_file}:make", opened, units="mm").sha256 == mm.sha256
     )  # drawn weights are the same every time
     assert mm.layer_names == ("encoder", "decoder", "head", "unused")
-    assert subject(f"{module_file}:make", opened, layers=["decoder.0"]).layer_names == ("decoder.0",)
+    assert subject(f"{module_file}:make", opened, layers=["decoder.0"]).layer_names == (
+        "decoder.0",
+    )

@@ -48,7 +48,9 @@ def test_the_exact_decoder_finds_every_plane(decoded, tmp_path):
     for row in planes:
         assert row["collapsed_share"] == 0 and row["mae_mm"] < 1
         assert row["mean_mm"] == pytest.approx(1000 * row["distance_m"], abs=0.5)
-    assert finding.values["objects"]["collapsed_share"] <= 0.02 and finding.values["range_mm"] is None
+    assert (
+        finding.values["objects"]["collapsed_share"] <= 0.02 and finding.values["range_mm"] is None
+    )
     assert len(finding.figure.png) > 5000
     save_finding(tmp_path, "known", "key", finding, 1.0)
 
@@ -63,15 +65,23 @@ def test_background_everywhere_is_a_collapse(opened, monkeypatch):
     assert low == pytest.approx(np.mean([record["depth_min_mm"] for record in records]))
     assert high == pytest.approx(np.mean([record["depth_max_mm"] for record in records]))
     # The answer 0.05 is rounded to float32 once.
-    assert finding.values["planes"][0]["mean_mm"] == pytest.approx(low + 0.05 * (high - low), abs=U32 * (high - low))
-    assert finding.values["objects"]["collapsed_share"] == 1 > finding.values["objects"]["collapsed_share_true"]
+    assert finding.values["planes"][0]["mean_mm"] == pytest.approx(
+        low + 0.05 * (high - low), abs=U32 * (high - low)
+    )
+    assert (
+        finding.values["objects"]["collapsed_share"]
+        == 1
+        > finding.values["objects"]["collapsed_share_true"]
+    )
     assert "100% of a rectangular plane" in finding.summary
 
 
 def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, monkeypatch):
     """A model that predicts background where less than half of its image is lit."""
     monkeypatch.setattr(flat_plane, "draw", lambda *arguments: None)
-    half_lit = answering(opened, lambda frames: np.full(frames[51].shape, (frames[51] < 60).mean()), "normalised")
+    half_lit = answering(
+        opened, lambda frames: np.full(frames[51].shape, (frames[51] < 60).mean()), "normalised"
+    )
     finding = FlatPlane().run(half_lit, opened, ProbeSettings(quick=True), silent)
     sizes = [row for row in finding.values["planes"] if row["outline"] in flat_plane.GROWING]
     height, width = opened.size
@@ -86,13 +96,20 @@ def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, monke
 def test_collapse_is_nearer_to_background_than_to_any_object():
     values = np.array([-1.0, 0.0, 749.0, 751.0])
     assert (values < background_below(False, 1500.0)).tolist() == [True, True, True, False]
-    assert (np.array([-1.2, 0.09, 0.11]) < background_below(True, 1500.0)).tolist() == [True, True, False]
+    assert (np.array([-1.2, 0.09, 0.11]) < background_below(True, 1500.0)).tolist() == [
+        True,
+        True,
+        False,
+    ]
 
 
 def test_who_is_told_the_mask_is_not_asked(opened):
     masked = answering(opened, lambda frames: frames[51])
     masked.uses_ground_truth_mask = True
-    assert "uses the object's mask" in FlatPlane().applies_to(masked) and Counterfactual().applies_to(masked) is None
+    assert (
+        "uses the object's mask" in FlatPlane().applies_to(masked)
+        and Counterfactual().applies_to(masked) is None
+    )
 
 
 def test_the_counterfactual_probe_reports_and_draws(opened, tmp_path):

@@ -39,7 +39,8 @@ def convolutions(*channels, kernel=1):
 
 @pytest.mark.parametrize("sign", [1, -1])  # each shows what the ReLU hides of the other
 def test_a_linear_network_has_the_heatmap_that_pen_and_paper_give(sign):
-    """Output mean = sum_c v_c mean(A_c) + const, so each channel weighs v_c / (H W), whatever the image."""
+    """Output mean = sum_c v_c mean(A_c) + const, so each channel weighs v_c / (H W), whatever the
+    image."""
     torch.manual_seed(0)
     network = convolutions(1, 3, 1)
     v = sign * torch.tensor([2.0, -1.0, 0.5])
@@ -48,7 +49,8 @@ def test_a_linear_network_has_the_heatmap_that_pen_and_paper_give(sign):
     fringe = torch.rand(2, 1, 6, 8)
     heatmap = torch.from_numpy(heatmaps(network, {"first": network[0]}, fringe)["first"])
     weighted = v.view(3, 1, 1) * network[0](fringe) / (6 * 8)
-    # A channel's weight is a sum over 6 x 8 pixels; fewer than 64 roundings of the magnitudes in all.
+    # A channel's weight is a sum over 6 x 8 pixels; fewer than 64 roundings of the magnitudes in
+    # all.
     tolerance = 64 * U32 * float(weighted.abs().sum(1).max())
     assert torch.allclose(heatmap, weighted.sum(1).clamp(min=0), rtol=0, atol=tolerance)
 
@@ -66,8 +68,11 @@ def test_a_bent_network_at_half_the_size_has_that_of_its_own_gradients():
         expected = functional.interpolate(heat, size=(8, 12), mode="bilinear")[0, 0].detach()
         assert (expected > 0).any()
         heatmap = torch.from_numpy(heatmaps(network, {"first": first}, fringe)["first"][sample])
-        # Sums over 24 gradients, 9 products, 4 channels and 4 neighbours: fewer than 64 roundings of the magnitudes.
-        assert torch.allclose(heatmap, expected.clamp(min=0), rtol=0, atol=64 * U32 * float(magnitudes.max()))
+        # Sums over 24 gradients, 9 products, 4 channels and 4 neighbours: fewer than 64 roundings
+        # of the magnitudes.
+        assert torch.allclose(
+            heatmap, expected.clamp(min=0), rtol=0, atol=64 * U32 * float(magnitudes.max())
+        )
 
 
 def test_layers_that_have_no_heatmap_are_refused():
@@ -89,16 +94,23 @@ def test_correlation_is_pearsons():
 
 
 def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_does():
-    correlations = {(target, layer): {0: [0.1] * 3} for layer in "ab" for target in (EDGES, FRINGES, OBJECT)}
+    correlations = {
+        (target, layer): {0: [0.1] * 3} for layer in "ab" for target in (EDGES, FRINGES, OBJECT)
+    }
     correlations[EDGES, "a"] = {0: [0.4, 0.2, None]}
     for layer, target in product("ab", (EDGES, FRINGES, OBJECT, OWN)):
-        by_network = {number: [r if target == OWN else None] * 3 for number, r in ((1, 0.2), (2, 0.4))}
+        by_network = {
+            number: [r if target == OWN else None] * 3 for number, r in ((1, 0.2), (2, 0.4))
+        }
         correlations[RANDOM + target, layer] = by_network
     means = means_of(correlations, ("a", "b"), ["x", "x", "y"])
     first = means["layers"]["a"]
     assert first[EDGES]["r"] == pytest.approx(0.3) and first[EDGES]["samples"] == 2
     assert first[RANDOM + OWN]["r"] == pytest.approx(0.3) and first[RANDOM + EDGES]["r"] is None
-    assert means["average"][EDGES]["r"] == pytest.approx(0.2) and means["average"][EDGES]["samples"] == 3
+    assert (
+        means["average"][EDGES]["r"] == pytest.approx(0.2)
+        and means["average"][EDGES]["samples"] == 3
+    )
     assert means["average"]["ratio"] == pytest.approx(2)
     for missing in (0.0, None):
         correlations[FRINGES, "a"] = {0: [missing] * 3}
@@ -106,7 +118,9 @@ def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_
 
 
 @pytest.mark.parametrize(("fields", "wins"), [(("edges",), EDGES), (("object",), FRINGES)])
-def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(opened, fields, wins):
+def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(
+    opened, fields, wins
+):
     """A network that outputs the Sobel map correlates with it by 1, at the layer where it is."""
     subject = oracle(opened, fields)
     correlations = measure(subject, opened, opened.samples("test")[:3], 1, silent)
@@ -116,7 +130,8 @@ def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(o
     if wins == EDGES:
         assert edges == pytest.approx(1, abs=1e-6)
         assert layer["ratio"] > 1.5
-    # The stand-in for random weights is the network itself: the sanity check must say that nothing changed.
+    # The stand-in for random weights is the network itself: the sanity check must say that nothing
+    # changed.
     assert layer[RANDOM + OWN]["r"] == pytest.approx(1, abs=1e-6)
     if wins == EDGES:
         assert correlations["edges_with_fringes"]["r"] == pytest.approx(fringes)
@@ -135,20 +150,31 @@ class Painted(nn.Module):
 
 @pytest.mark.parametrize(("plane", "side"), PLANES.items())
 def test_heatmaps_of_a_plane_are_compared_with_the_plane(opened, plane, side):
-    """Heat on the plane, on its edges, everywhere: the last has no correlation, which is unknown and not NaN."""
+    """Heat on the plane, on its edges, everywhere: the last has no correlation, which is unknown
+    and not NaN."""
     on_it = rectangle(opened.size, side)
     edges = edge_map(np.where(on_it, 1800.0, 0.0))
     for painted, target in ((on_it, OBJECT), (edges, EDGES), (np.ones(opened.size), None)):
         subject = subject_with(Painted(painted), opened.size)
         fringe, maps = shown(subject, opened, plane)
         (heat,) = heatmaps(subject.network, {"out": subject.network.out}, fringe)["out"]
-        assert fringe.shape == (1, 1, *opened.size) and heat.shape == opened.size and np.isfinite(heat).all()
+        assert (
+            fringe.shape == (1, 1, *opened.size)
+            and heat.shape == opened.size
+            and np.isfinite(heat).all()
+        )
         assert (maps[OBJECT] == on_it).all()
         measured = measure(subject, opened, [plane], 1, silent)["layers"]["out"]
-        for column in (EDGES, FRINGES, OBJECT):  # the stand-in for random weights is the network itself
+        for column in (
+            EDGES,
+            FRINGES,
+            OBJECT,
+        ):  # the stand-in for random weights is the network itself
             assert measured[RANDOM + column] == measured[column]
         assert target is None or measured[target]["r"] == pytest.approx(1, abs=1e-6)
-        assert target is not None or {measured[column]["r"] for column in (EDGES, FRINGES, OBJECT)} == {None}
+        assert target is not None or {
+            measured[column]["r"] for column in (EDGES, FRINGES, OBJECT)
+        } == {None}
 
 
 def test_random_weights_come_from_the_seed_alone():
@@ -168,7 +194,9 @@ def test_random_weights_come_from_the_seed_alone():
             self.weight = nn.Parameter(torch.arange(30.0))
 
     shuffled = randomised(Bare(), 0).weight
-    assert torch.equal(shuffled.sort().values, torch.arange(30.0)) and not torch.equal(shuffled, torch.arange(30.0))
+    assert torch.equal(shuffled.sort().values, torch.arange(30.0)) and not torch.equal(
+        shuffled, torch.arange(30.0)
+    )
 
 
 def test_the_papers_six_layers_are_taken_where_there_are_nine(opened):

@@ -1,4 +1,5 @@
-"""Probes against closed forms: what they are asked for, how they are fitted, and networks whose answer is known."""
+"""Probes against closed forms: what they are asked for, how they are fitted, and networks whose
+answer is known."""
 
 import numpy as np
 import pytest
@@ -44,7 +45,8 @@ def test_edges_are_scipys_sobel():
     depth = ndimage.gaussian_filter(RNG.normal(size=(20, 30)), 2)
     across, down = (ndimage.sobel(depth, axis, mode="mirror") for axis in (1, 0))
     expected = np.hypot(across, down)
-    # Sobel's weights have magnitudes that sum to 8; depth, products, sums and root are rounded to float32 8 times.
+    # Sobel's weights have magnitudes that sum to 8; depth, products, sums and root are rounded to
+    # float32 8 times.
     tolerance = 8 * 8 * U32 * np.abs(depth).max() / expected.max()
     assert edge_map(depth) == pytest.approx(expected / expected.max(), abs=tolerance)
     assert not edge_map(np.full((5, 5), 1800.0)).any()
@@ -66,7 +68,9 @@ def test_true_phase_is_the_one_that_eighteen_frames_measure(opened, direction):
     sine, outside = ground_truth["sine"], ground_truth["object"] == 0
     inside = ndimage.binary_erosion(~outside & (measured.modulation > 20), iterations=3)
     assert inside.sum() > 200
-    error_rad = np.angle(np.exp(1j * (measured.phase - np.arctan2(sine, ground_truth["cosine"]))))[inside]
+    error_rad = np.angle(np.exp(1j * (measured.phase - np.arctan2(sine, ground_truth["cosine"]))))[
+        inside
+    ]
     assert np.median(np.abs(error_rad)) < 0.02
     assert not sine[outside].any() and not ground_truth["order"][outside].any()
 
@@ -80,8 +84,11 @@ def test_phase_and_order_together_are_the_depth(opened):
     reference = np.floor(rig.project(points)[1] / rig.pitch("horizontal"))
     phase = np.arctan2(ground_truth["sine"], ground_truth["cosine"]) % (2 * np.pi)
     row = (reference + ground_truth["order"] + phase / (2 * np.pi)) * rig.pitch("horizontal")
-    decoded_mm = depth_from_coordinate(rig.camera.rays(), np.where(inside, row, np.nan), rig, "horizontal")
-    # Sine and cosine are rounded to float32: 2 u in phase, and 1 rad is less than half of the depth.
+    decoded_mm = depth_from_coordinate(
+        rig.camera.rays(), np.where(inside, row, np.nan), rig, "horizontal"
+    )
+    # Sine and cosine are rounded to float32: 2 u in phase, and 1 rad is less than half of the
+    # depth.
     assert decoded_mm[inside] == pytest.approx(depth_mm[inside], rel=2 * U32)
     with pytest.raises(ValueError, match="zero-size array"):
         truth(np.zeros_like(depth_mm), rig, "horizontal")
@@ -123,15 +130,22 @@ def test_constant_and_copied_channels_do_no_harm():
 def test_pixels_of_a_coarse_layer_are_those_of_the_upsampled_one():
     features, size = torch.randn(2, 3, 5, 7), (20, 28)
     pixels = torch.arange(size[0] * size[1]).expand(2, -1)
-    expected = functional.interpolate(features, size=size, mode="bilinear", align_corners=False).flatten(2)
-    # A place in the map is rounded to some u of its width, and neighbours differ by twice the largest value at most.
+    expected = functional.interpolate(
+        features, size=size, mode="bilinear", align_corners=False
+    ).flatten(2)
+    # A place in the map is rounded to some u of its width, and neighbours differ by twice the
+    # largest value at most.
     tolerance = 8 * U32 * 2 * 7 * float(features.abs().max())
-    assert torch.allclose(at_pixels(features, pixels, size)[:, :, 0], expected, rtol=0, atol=tolerance)
+    assert torch.allclose(
+        at_pixels(features, pixels, size)[:, :, 0], expected, rtol=0, atol=tolerance
+    )
     fine = torch.randn(2, 3, *size)
     assert torch.equal(at_pixels(fine, pixels, size)[:, :, 0], fine.flatten(2))
     # Means of 16 values, added in any order.
     tolerance = 16 * U32 * float(fine.abs().max())
-    assert torch.allclose(at_size(fine, (5, 7)), functional.avg_pool2d(fine, 4), rtol=0, atol=tolerance)
+    assert torch.allclose(
+        at_size(fine, (5, 7)), functional.avg_pool2d(fine, 4), rtol=0, atol=tolerance
+    )
     assert at_size(fine, size).data_ptr() != fine.data_ptr()
 
 
@@ -142,9 +156,13 @@ def test_activations_are_taken_before_a_later_layer_works_in_place_on_them():
     expected = network[0](image)
     assert (expected < 0).any()
     layers = {"conv": network[0]}
-    activations = activations_of(network, layers, image, lambda features: at_size(features, (4, 4)), "known")
+    activations = activations_of(
+        network, layers, image, lambda features: at_size(features, (4, 4)), "known"
+    )
     assert torch.equal(activations["conv"], expected)
-    with pytest.raises(DiagnosisError, match="expected activations"):  # an image without its batch axis: (C, h, w)
+    with pytest.raises(
+        DiagnosisError, match="expected activations"
+    ):  # an image without its batch axis: (C, h, w)
         activations_of(network, layers, image[0], lambda features: features, "known")
     assert not network[0]._forward_hooks
 
@@ -186,10 +204,17 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     torch.manual_seed(0)
 
     def batch():
-        features = {("trained", 0, "a"): torch.randn(8, 3, 12, 12), ("untrained", 0, "b"): torch.randn(8, 3, 12, 12)}
+        features = {
+            ("trained", 0, "a"): torch.randn(8, 3, 12, 12),
+            ("untrained", 0, "b"): torch.randn(8, 3, 12, 12),
+        }
         bumps = features["trained", 0, "a"][:, :1].abs()
         edges = functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)
-        return features, {"image": torch.ones_like(bumps), "object": torch.ones_like(bumps), "edges": edges}
+        return features, {
+            "image": torch.ones_like(bumps),
+            "object": torch.ones_like(bumps),
+            "edges": edges,
+        }
 
     features, target = batch()
     probes = ConvolutionProbes(None, None, {"edges": SPATIAL["edges"]}, None, 2, 90)
@@ -197,7 +222,9 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     probes.start(1)
     here, other = ("trained", 0, "a"), ("untrained", 0, "b")
     assert set(probes.probes) == {(here, "edges", 0), (here, "edges", 1), (other, "edges", 0)}
-    reference = (target["edges"].double() - target["edges"].double().mean()).square().mean((1, 2, 3))
+    reference = (
+        (target["edges"].double() - target["edges"].double().mean()).square().mean((1, 2, 3))
+    )
     found = probes.errors_of_batch(features, target)
     assert set(found) == {*probes.probes, (MEAN, "edges", 0)}
     for errors in found.values():
@@ -222,7 +249,9 @@ def errors_of(probes, opened, step):
 
 
 def linear_r2(subject, opened):
-    errors = errors_of(LinearProbes(subject, opened, LINEAR, lambda count, activity: None), opened, 2)
+    errors = errors_of(
+        LinearProbes(subject, opened, LINEAR, lambda count, activity: None), opened, 2
+    )
     return {
         (layer, target): 1 - np.mean(sample_errors) / np.mean(errors[MEAN, target, 0])
         for ((_, _, layer), target, _), sample_errors in errors.items()
@@ -236,7 +265,8 @@ def spatial_errors(subject, opened, epochs):
 
 @pytest.mark.parametrize("target", LINEAR)
 def test_what_a_layer_holds_is_read_from_it(opened, target):
-    """A network that outputs the Sobel map is a pure edge reader, one that holds sine and cosine reads the phase."""
+    """A network that outputs the Sobel map is a pure edge reader, one that holds sine and cosine
+    reads the phase."""
     r2 = linear_r2(oracle(opened, LINEAR[target].maps), opened)
     assert r2["out", target] > 0.999
     for other_target in {"edges", "phase"} - {target}:
@@ -255,15 +285,21 @@ def test_the_layer_of_an_identity_is_the_raw_input(opened):
     r2 = linear_r2(subject_with(Same(), opened.size), opened)
     for target in LINEAR:
         assert r2["out", target] == r2[INPUT, target]
-    # One grey level holds the cosine, up to brightness, and nothing of the sine: half of the phase at most.
+    # One grey level holds the cosine, up to brightness, and nothing of the sine: half of the phase
+    # at most.
     assert 0.2 < r2[INPUT, "phase"] < 0.5
 
 
 def test_spatial_probes_of_an_edge_reader_read_edges(opened):
     subject = oracle(opened, ("edges",))
     errors = spatial_errors(subject, opened, 25)
-    remaining = {key: np.mean(values) / np.mean(errors[MEAN, key[1], 0]) for key, values in errors.items()}
-    trained, raw = remaining[("trained", 0, "out"), "edges", 0], remaining[(CONTROLS, 0, INPUT), "edges", 0]
+    remaining = {
+        key: np.mean(values) / np.mean(errors[MEAN, key[1], 0]) for key, values in errors.items()
+    }
+    trained, raw = (
+        remaining[("trained", 0, "out"), "edges", 0],
+        remaining[(CONTROLS, 0, INPUT), "edges", 0],
+    )
     assert trained < 0.25 and trained < raw
 
 
@@ -277,7 +313,9 @@ def test_a_layer_that_holds_the_mask_alone_is_the_silhouette_control(opened):
         assert r2[SILHOUETTE, target] == 0  # and of the depth within it nothing
     errors = spatial_errors(subject, opened, 2)
     for name in SPATIAL:
-        assert errors[("trained", 0, "out"), name, 0] == pytest.approx(errors[(CONTROLS, 0, SILHOUETTE), name, 0])
+        assert errors[("trained", 0, "out"), name, 0] == pytest.approx(
+            errors[(CONTROLS, 0, SILHOUETTE), name, 0]
+        )
         assert len(errors[MEAN, name, 0]) == len(opened.samples("validation"))
 
 
@@ -287,7 +325,12 @@ def test_depth_on_the_object_is_compared_there_and_with_the_mean_there(opened):
 
     def within(name):
         depth_mm = opened.depth_mm(name)
-        full = at_size(torch.from_numpy(object_mask(depth_mm)[None, None].astype(np.float32)), side).numpy() == 1
+        full = (
+            at_size(
+                torch.from_numpy(object_mask(depth_mm)[None, None].astype(np.float32)), side
+            ).numpy()
+            == 1
+        )
         depth = truth(depth_mm, opened.rig, "horizontal")["depth"]
         return at_size(torch.from_numpy(depth[None, None]), side).numpy()[full].astype(float)
 

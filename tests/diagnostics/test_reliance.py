@@ -1,4 +1,5 @@
-"""Phase reliance: what its parts are for answers that are known, and the score of readers that are known."""
+"""Phase reliance: what its parts are for answers that are known, and the score of readers that are
+known."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -58,7 +59,11 @@ def test_nothing_asked_is_no_score():
     assert follows([]) is None and follows([change(0 * RAMP, RAMP)]) is None
     assert sample_score(None, 0.0) is None
     assert relative_change([change(RAMP, RAMP)], 0.0) is None and relative_change([], 1.0) is None
-    assert sample_score(0.5, None) == 0.5 and sample_score(0.5, 0.5) == 0.25 and sample_score(1.0, 3.0) == 0.0
+    assert (
+        sample_score(0.5, None) == 0.5
+        and sample_score(0.5, 0.5) == 0.25
+        and sample_score(1.0, 3.0) == 0.0
+    )
 
 
 def test_a_change_with_the_outline_counts_in_units_of_what_the_phase_asks():
@@ -74,7 +79,11 @@ def test_a_change_with_the_outline_counts_in_units_of_what_the_phase_asks():
 def test_an_answer_of_zero_mm_is_none():
     before, after, expected = np.array([0.0, 5.0, 5.0]), np.array([7.0, 0.0, 7.0]), np.full(3, 2.0)
     zero_change = Change.of(before, after, expected, (before != 0) & (after != 0))
-    assert zero_change.actual.tolist() == [0, 0, 2] and zero_change.answered.tolist() == [False, False, True]
+    assert zero_change.actual.tolist() == [0, 0, 2] and zero_change.answered.tolist() == [
+        False,
+        False,
+        True,
+    ]
     assert Change.of(before, after, expected, np.ones(3, dtype=bool)).actual.tolist() == [7, -5, 2]
 
 
@@ -84,7 +93,9 @@ def test_order_free_forgives_periods_and_credits_no_chance():
     assert order_free_follows([change(RAMP, 0 * RAMP)]) == 0.0
     chance = np.random.default_rng(2).uniform(-np.pi, np.pi, 20_000)
     assert order_free_follows([change(np.resize(RAMP, chance.size), chance)]) == 0.0
-    assert relative_change(order_free([change(0 * RAMP, periods)]), 1.0) == pytest.approx(0.0, abs=1e-12)
+    assert relative_change(order_free([change(0 * RAMP, periods)]), 1.0) == pytest.approx(
+        0.0, abs=1e-12
+    )
 
 
 @dataclass
@@ -108,7 +119,9 @@ def sobel(image):
 
 
 def silhouette(frames):
-    return (frames[51] > 75).astype(np.uint8)  # white light: the background is too far to be that bright
+    return (frames[51] > 75).astype(
+        np.uint8
+    )  # white light: the background is too far to be that bright
 
 
 def template(frames):
@@ -119,7 +132,8 @@ def template(frames):
 def normalised(depth_mm):
     inside = depth_mm > 0
     return (
-        (np.where(inside, depth_mm, depth_mm[inside].min()) - depth_mm[inside].min()) / np.ptp(depth_mm[inside])
+        (np.where(inside, depth_mm, depth_mm[inside].min()) - depth_mm[inside].min())
+        / np.ptp(depth_mm[inside])
         if (inside.any())
         else depth_mm
     )
@@ -146,7 +160,9 @@ def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
     assert reliance.parts.follows_light is not None and reliance.parts.follows_light <= 0.02
     assert reliance.parts.change_outline <= 0.02 and reliance.parts.change_no_fringe_outside <= 0.02
     assert (
-        reliance.units == units and reliance.objects == 2 and reliance.dataset_fingerprint == scene_set[0].fingerprint
+        reliance.units == units
+        and reliance.objects == 2
+        and reliance.dataset_fingerprint == scene_set[0].fingerprint
     )
     scores = [sample["score"] for sample in samples.values()]
     interval = object_interval(scores, [split_sample_name(name)[0] for name in samples])
@@ -154,14 +170,19 @@ def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
     if units == "mm":
         assert reliance.order_free_score >= 0.98 and reliance.parts.follows_constant >= 0.98
         assert reliance.parts.answered_no_fringe_inside <= 0.02
-        assert reliance.parts.change_other_direction is None or reliance.parts.change_other_direction > 1
+        assert (
+            reliance.parts.change_other_direction is None
+            or reliance.parts.change_other_direction > 1
+        )
     else:
         assert reliance.order_free_score is None and reliance.parts.follows_constant is None
 
 
 def test_an_answer_of_another_form_is_named(scene_set):
     reader = Reader(lambda frames: np.zeros((3, 3)))
-    with pytest.raises(PredictionError, match=r"Reader: the method gave float32 \(3, 3\), expected float32 \("):
+    with pytest.raises(
+        PredictionError, match=r"Reader: the method gave float32 \(3, 3\), expected float32 \("
+    ):
         measure(reader, *scene_set)
 
 
@@ -175,7 +196,14 @@ def test_an_answer_of_another_form_is_named(scene_set):
         Reader(lambda frames: 1500 + 2 * cv2.GaussianBlur(frames[0], (0, 0), 6).astype(float)),
         Reader(lambda frames: np.zeros(frames[0].shape)),
     ],
-    ids=["edges of the fringe", "edges of the mask", "template", "constant", "brightness", "no answer"],
+    ids=[
+        "edges of the fringe",
+        "edges of the mask",
+        "template",
+        "constant",
+        "brightness",
+        "no answer",
+    ],
 )
 def test_readers_of_shape_have_no_phase_reliance(reader, scene_set):
     reliance, _ = measure(reader, *scene_set)

@@ -1,4 +1,5 @@
-"""Counterfactual scenes: the unchanged one is the dataset's, and a changed one differs in what it says."""
+"""Counterfactual scenes: the unchanged one is the dataset's, and a changed one differs in what it
+says."""
 
 from dataclasses import replace
 
@@ -44,7 +45,9 @@ def sample_scene(opened, renderer):
 
 @pytest.fixture(scope="module")
 def scenes(opened, renderer, sample_scene):
-    return counterfactuals(renderer, sample_scene, "horizontal", [object_mask(opened.depth_mm(OTHER))])
+    return counterfactuals(
+        renderer, sample_scene, "horizontal", [object_mask(opened.depth_mm(OTHER))]
+    )
 
 
 def of_kind(scenes, *kinds):
@@ -57,14 +60,18 @@ WORN = (
     .changed(calibration_px=0.0)
     .changed("camera", blur_px=0.0, falloff=0, exposure=0.8)
 )
-"""A defocused, flickering projector and a sensor with a response: stages that scenes share with their dataset."""
+"""A defocused, flickering projector and a sensor with a response: stages that scenes share with
+their dataset."""
 
 
 @pytest.mark.parametrize("light", [named_light("paper"), WORN], ids=["paper", "hard"])
 def test_an_unchanged_scene_is_the_datasets_own(light, tmp_path):
-    """Of a dataset in direct light, one ray a pixel: bounces and mixed pixels need the mesh, which a scene has not."""
+    """Of a dataset in direct light, one ray a pixel: bounces and mixed pixels need the mesh, which
+    a scene has not."""
     direct = light.changed("bounces", interreflection=False, ambient_occlusion=False, shadows=False)
-    settings = tiny_settings(light=direct.changed("camera", rays_across=1), objects=("mug", "power_drill"))
+    settings = tiny_settings(
+        light=direct.changed("camera", rays_across=1), objects=("mug", "power_drill")
+    )
     build(tmp_path / "direct", settings, workers=1)
     dataset = DatasetFolder(tmp_path / "direct")
     renderer = SceneRenderer.of(dataset)
@@ -97,10 +104,15 @@ def test_direct_light_keeps_projector_sensor_and_brightness():
     assert {name for name, on in hard.stages().items() if on and not direct.stages()[name]} <= off
     assert not any(direct.stages()[name] for name in off)
     low, high = hard.camera.exposure
-    assert direct.camera.exposure == pytest.approx(np.sqrt(low * high)) and direct_light(direct) == direct
+    assert (
+        direct.camera.exposure == pytest.approx(np.sqrt(low * high))
+        and direct_light(direct) == direct
+    )
 
 
-def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, sample_scene, scenes):
+def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(
+    opened, renderer, sample_scene, scenes
+):
     sequence, layer = opened.sequence, layer_of(opened.rig, "horizontal")
     before = layer.at(sample_scene.mask).absolute_phase(sample_scene.depth_mm[sample_scene.mask])
     moves = of_kind(scenes, "phase", "constant")
@@ -110,10 +122,15 @@ def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, render
         assert ((move.scene.depth_mm > 0) == (sample_scene.depth_mm > 0)).all()
         object_depths = move.scene.depth_mm[move.scene.depth_mm > 0]
         assert near_mm - 1e-6 <= object_depths.min() and object_depths.max() <= far_mm + 1e-6
-        shift = layer.at(sample_scene.mask).absolute_phase(move.scene.depth_mm[sample_scene.mask]) - before
+        shift = (
+            layer.at(sample_scene.mask).absolute_phase(move.scene.depth_mm[sample_scene.mask])
+            - before
+        )
         assert np.abs(shift).max() <= abs(move.amplitude_rad) + 1e-9 <= LARGEST_SHIFT_RAD + 2e-9
         white = renderer.frames(move.scene, [sequence.white])[sequence.white]
-        np.testing.assert_array_equal(white, renderer.frames(sample_scene, [sequence.white])[sequence.white])
+        np.testing.assert_array_equal(
+            white, renderer.frames(sample_scene, [sequence.white])[sequence.white]
+        )
     bump = next(move for move in of_kind(scenes, "light") if move.name == "bump")
     fringe, unmoved = (renderer.frames(scene, [0])[0] for scene in (bump.scene, sample_scene))
     assert (fringe != unmoved).any()
@@ -125,7 +142,8 @@ def test_a_moved_plane_keeps_its_law():
     still = moved(surface, rig, "vertical", lambda x, y: np.zeros_like(x))
     np.testing.assert_allclose(still.depth_m, surface.depth_m, rtol=1e-12)
     np.testing.assert_allclose(still.normals, surface.normals, atol=1e-5)
-    # psi = gain / Z is linear in 1 / Z on the paper's rig, so a plane moved by a linear shift is a plane again.
+    # psi = gain / Z is linear in 1 / Z on the paper's rig, so a plane moved by a linear shift is a
+    # plane again.
     tilted = moved(surface, rig, "vertical", lambda x, y: 1.0 + 8.0 * x - 5.0 * y)
     design = np.column_stack([surface.x, surface.y, np.ones_like(surface.x)])
     law, *_ = np.linalg.lstsq(design, 1 / tilted.depth_m, rcond=None)
@@ -138,7 +156,12 @@ def test_a_moved_plane_keeps_its_law():
 
 def test_a_move_shifts_both_carriers_of_crossed_frames_as_a_change_of_depth_does():
     rig = crossed_rig(48)
-    for bent in (rig, replace(rig, projector=replace(rig.projector, distortion=(-0.08, 0.05, 0.001, -0.001, 0.0)))):
+    for bent in (
+        rig,
+        replace(
+            rig, projector=replace(rig.projector, distortion=(-0.08, 0.05, 0.001, -0.001, 0.0))
+        ),
+    ):
         surface = plane(bent, 1.8, tilt_deg=(10.0, 5.0))
         nearer = moved(surface, bent, "crossed", lambda x, y: 1 + x, 0.3)
         seen = [bent.project(one.points_m()) for one in (surface, nearer)]
@@ -168,7 +191,9 @@ def test_crossed_fringes_are_mirrored_and_widened():
         name: np.abs(np.fft.fftfreq(320)[list(np.unravel_index(power.argmax(), power.shape))])
         for name, power in spectra.items()
     }
-    assert np.hypot(*peaks["other pitch"]) == pytest.approx(np.hypot(*peaks["sequence"]) / PITCH_FACTOR, rel=0.05)
+    assert np.hypot(*peaks["other pitch"]) == pytest.approx(
+        np.hypot(*peaks["sequence"]) / PITCH_FACTOR, rel=0.05
+    )
     mirrored = spectra["other direction"][:, 1:], spectra["sequence"][:, :0:-1]
     assert np.corrcoef(mirrored[0].ravel(), mirrored[1].ravel())[0, 1] > 0.9
 
@@ -176,10 +201,16 @@ def test_crossed_fringes_are_mirrored_and_widened():
 def test_another_outline_leaves_what_is_kept_as_it_was(renderer, sample_scene, scenes):
     frame = renderer.frames(sample_scene, [0])[0]
     outline_changes = of_kind(scenes, "outline")
-    assert [change.name for change in outline_changes] == ["ellipse", "another object's outline", "grown"]
+    assert [change.name for change in outline_changes] == [
+        "ellipse",
+        "another object's outline",
+        "grown",
+    ]
     for outline_change in outline_changes:
         unchanged = outline_change.scene.mask & sample_scene.mask
-        assert unchanged.any() and (outline_change.name == "grown" or (outline_change.scene.mask == unchanged).all())
+        assert unchanged.any() and (
+            outline_change.name == "grown" or (outline_change.scene.mask == unchanged).all()
+        )
         changed_frame = renderer.frames(outline_change.scene, [0])[0]
         np.testing.assert_array_equal(changed_frame[unchanged], frame[unchanged])
         assert (changed_frame != frame).any()
@@ -187,10 +218,14 @@ def test_another_outline_leaves_what_is_kept_as_it_was(renderer, sample_scene, s
         assert (masked_frame[~outline_change.scene.mask] == 0).all()
     ellipse, _, grown = outline_changes
     assert 0.45 < ellipse.scene.mask.sum() / sample_scene.mask.sum() < 0.55
-    assert (sample_scene.mask <= grown.scene.mask).all() and sample_scene.mask.sum() < grown.scene.mask.sum()
+    assert (
+        sample_scene.mask <= grown.scene.mask
+    ).all() and sample_scene.mask.sum() < grown.scene.mask.sum()
 
 
-def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer, sample_scene, scenes):
+def test_fringes_are_removed_swapped_and_widened_where_it_says(
+    opened, renderer, sample_scene, scenes
+):
     sequence = opened.sequence
     reprojected = {variant.name: variant.scene for variant in of_kind(scenes, "projected")}
     inside = np.zeros(renderer.shape, dtype=bool)
@@ -211,10 +246,14 @@ def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer,
         for index in (sequence.white, sequence.black)
     )
     assert np.median(level - (white + black) / 2) == pytest.approx(0, abs=1.0)
-    np.testing.assert_array_equal(swing("no fringe inside")[~inside], np.ptp(usual, axis=0)[~inside])
+    np.testing.assert_array_equal(
+        swing("no fringe inside")[~inside], np.ptp(usual, axis=0)[~inside]
+    )
     np.testing.assert_array_equal(swing("no fringe outside")[inside], np.ptp(usual, axis=0)[inside])
     swapped = renderer.frames(reprojected["other direction"], [0, sequence.white])
-    np.testing.assert_array_equal(swapped[0], renderer.frames(sample_scene, [sequence.steps])[sequence.steps])
+    np.testing.assert_array_equal(
+        swapped[0], renderer.frames(sample_scene, [sequence.steps])[sequence.steps]
+    )
     np.testing.assert_array_equal(
         swapped[sequence.white], renderer.frames(sample_scene, [sequence.white])[sequence.white]
     )
@@ -222,7 +261,9 @@ def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer,
     plain = renderer.frames(sample_scene, [0])[0][:, 4].astype(float)
 
     def period(values):
-        return 1 / np.fft.rfftfreq(4096)[np.argmax(np.abs(np.fft.rfft(values - values.mean(), 4096)))]
+        return (
+            1 / np.fft.rfftfreq(4096)[np.argmax(np.abs(np.fft.rfft(values - values.mean(), 4096)))]
+        )
 
     assert period(column) / period(plain) == pytest.approx(PITCH_FACTOR, rel=0.03)
 
@@ -237,7 +278,10 @@ def test_samples_are_spread_over_objects_and_views(opened):
         "cork_A240",
         "cork_A60",
     ]
-    assert all(outlines and outlines[0].split("_")[0] != sample.split("_")[0] for sample, outlines in chosen)
+    assert all(
+        outlines and outlines[0].split("_")[0] != sample.split("_")[0]
+        for sample, outlines in chosen
+    )
     with pytest.raises(DiagnosisError, match="no sample with an object"):
         chosen_samples_of_nothing(opened)
 

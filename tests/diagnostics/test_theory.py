@@ -1,4 +1,5 @@
-"""The two theorems: frames that are the same bytes at two depths, and exponents against closed forms."""
+"""The two theorems: frames that are the same bytes at two depths, and exponents against closed
+forms."""
 
 from dataclasses import replace
 
@@ -26,7 +27,10 @@ def test_two_depths_give_the_same_bytes(direction, other_frame, opened):
     distance_mm = np.abs(twins.depths_mm[1] - twins.depths_mm[0])[inside]
     assert distance_mm.min() > 150 and ((twins.depths_mm[1] > 0) == inside).all()
     np.testing.assert_array_equal(twins.frames[0], twins.frames[1])
-    assert twins.other_frame == other_frame and (twins.other_frames[0] != twins.other_frames[1]).mean() > 0.01
+    assert (
+        twins.other_frame == other_frame
+        and (twins.other_frames[0] != twins.other_frames[1]).mean() > 0.01
+    )
     assert 0 < twins.paint.min() <= twins.paint.max() <= 1
 
 
@@ -46,17 +50,25 @@ def test_one_period_against_the_closed_form(direction, baseline_m):
         assert away == pytest.approx(1000 * z**2 * kappa / (1 - z * kappa), rel=1e-9)
         assert toward == pytest.approx(1000 * z**2 * kappa / (1 + z * kappa), rel=1e-9)
         # The closed form's own: Z^2 / (1 -+ Z kappa).
-        assert exponent(rig, direction, z, 1.0) == pytest.approx(2 + z * kappa / (1 - z * kappa), rel=1e-6)
-        assert exponent(rig, direction, z, -1.0) == pytest.approx(2 - z * kappa / (1 + z * kappa), rel=1e-6)
+        assert exponent(rig, direction, z, 1.0) == pytest.approx(
+            2 + z * kappa / (1 - z * kappa), rel=1e-6
+        )
+        assert exponent(rig, direction, z, -1.0) == pytest.approx(
+            2 - z * kappa / (1 + z * kappa), rel=1e-6
+        )
     beyond = 1.01 / kappa
-    assert depth_error_mm(rig, direction, beyond, 1.0) is None and exponent(rig, direction, beyond, 1.0) is None
+    assert (
+        depth_error_mm(rig, direction, beyond, 1.0) is None
+        and exponent(rig, direction, beyond, 1.0) is None
+    )
 
 
 def test_the_exponent_is_two_where_the_mistake_is_small_and_the_baseline_thin():
     rig = paper_rig(176)
     for z in DISTANCES_M:
         assert exponent(rig, "horizontal", z, 1 / 64) == pytest.approx(2, rel=0.01)
-    # With a projector 0.1 m behind, psi = gain / (Z + 0.1): the local exponent is 2 Z / (Z + 0.1) for a small mistake.
+    # With a projector 0.1 m behind, psi = gain / (Z + 0.1): the local exponent is 2 Z / (Z + 0.1)
+    # for a small mistake.
     behind = replace(rig, translation_m=(*rig.translation_m[:2], rig.translation_m[2] + 0.1))
     assert exponent(behind, "horizontal", 0.5, 1 / 64) == pytest.approx(2 * 0.5 / 0.6, rel=0.01)
 

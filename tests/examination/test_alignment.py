@@ -1,4 +1,5 @@
-"""The epipolar residual as a whole: what moved since the calibration is named with its size, and nothing else is."""
+"""The epipolar residual as a whole: what moved since the calibration is named with its size, and
+nothing else is."""
 
 from dataclasses import replace
 
@@ -11,7 +12,9 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import rotation_matrix
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
-RIG = rig_from_dict({**paper_rig(200).to_dict(), "sequence": {"steps": 6, "bits_horizontal": 7, "bits_vertical": 7}})
+RIG = rig_from_dict(
+    {**paper_rig(200).to_dict(), "sequence": {"steps": 6, "bits_horizontal": 7, "bits_vertical": 7}}
+)
 CAMERA = RIG.camera
 
 
@@ -30,7 +33,10 @@ def examined(shown, rig=RIG, **options):
     "shown, said",
     [
         (turned(0, 0, 0.6), "camera: a roll by 0.60 degrees"),
-        (replace(RIG, camera=replace(CAMERA, fx=0.97 * CAMERA.fx, fy=0.97 * CAMERA.fy)), "length -3.0"),
+        (
+            replace(RIG, camera=replace(CAMERA, fx=0.97 * CAMERA.fx, fy=0.97 * CAMERA.fy)),
+            "length -3.0",
+        ),
         (
             replace(RIG, camera=replace(CAMERA, cx=CAMERA.cx - 12, cy=CAMERA.cy - 9)),
             "another window or principal point",
@@ -49,7 +55,9 @@ def test_a_large_pattern_is_refused_and_a_small_one_is_in_the_uncertainty():
     assert [finding.severity for finding in small.findings] == ["note"]
     rms_px = float(small.findings[0].evidence.split(" by ")[1].split()[0])
     for direction in RIG.directions:
-        assert small.systematic_rad[direction] == pytest.approx(2 * np.pi * rms_px / RIG.pitch(direction), rel=0.01)
+        assert small.systematic_rad[direction] == pytest.approx(
+            2 * np.pi * rms_px / RIG.pitch(direction), rel=0.01
+        )
 
 
 def test_a_right_calibration_gives_no_finding_and_one_direction_says_what_it_can_not_tell():

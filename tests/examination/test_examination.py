@@ -43,13 +43,17 @@ def frames_of(rig, **light):
 def said(frames, rig, **options):
     """Names and texts of what refuses or warns."""
     found = examine(frames, rig, **options)
-    return [(finding.name, str(finding)) for finding in found.findings if finding.severity != "note"]
+    return [
+        (finding.name, str(finding)) for finding in found.findings if finding.severity != "note"
+    ]
 
 
 def photographed(rig, light, name="mug", view="A60", **changes):
     """Frames of an object by the renderer."""
     light = light if not isinstance(light, str) else named_light(light)
-    row = Studio(BuildSettings(rig, (name,), light=light.model_copy(update=changes))).photograph(solid_mesh(name), view)
+    row = Studio(BuildSettings(rig, (name,), light=light.model_copy(update=changes))).photograph(
+        solid_mesh(name), view
+    )
     return np.stack([row.frames[index] for index in range(len(rig.sequence))])
 
 
@@ -77,7 +81,9 @@ def test_gamma_and_noise_are_no_faults_and_gamma_is_named_where_it_shows(steps, 
     bent = 255 * (light / 255) ** gamma + np.random.default_rng(1).normal(0, noise, light.shape)
     found = examine(np.clip(np.rint(bent), 0, 255).astype(np.uint8), rig)
     assert not [finding for finding in found.findings if finding.severity != "note"]
-    assert ("response" in [finding.name for finding in found.findings]) == (gamma > 1 and steps <= 4)
+    assert ("response" in [finding.name for finding in found.findings]) == (
+        gamma > 1 and steps <= 4
+    )
 
 
 @pytest.mark.parametrize("steps", [3, 8])
@@ -102,7 +108,9 @@ def test_lamps_that_flicker_by_two_percent_are_no_fault(steps):
 def test_a_late_frame_is_a_wrong_step_and_no_response(steps):
     rig = vertical(FOUR | {"steps": steps})
     frames = frames_of(rig)
-    frames[steps - 1] = np.rint((frames[steps - 1].astype(float) + frames[steps - 2]) / 2).astype(np.uint8)
+    frames[steps - 1] = np.rint((frames[steps - 1].astype(float) + frames[steps - 2]) / 2).astype(
+        np.uint8
+    )
     assert [name for name, _ in said(frames, rig)] == ["wrong step"]
 
 
@@ -125,19 +133,43 @@ BITS = 5
 NINE = 4 + BITS
 PAIRS = {"scheme": "gray", "cell_px": 8, "inverse": "after each"}  # 7 bits
 READINGS = {
-    "pairs least first": (PAIRS, moved([12, 13, 10, 11, 8, 9, 6, 7, 4, 5, 2, 3, 0, 1]), "least significant bit first"),
-    "inverse after all": (PAIRS, moved([*range(0, 14, 2), *range(1, 14, 2)]), "inverse frames come after all"),
-    "Gray code first": (FOUR, moved([*range(4, NINE), *range(4)]), "order vertical Gray code, vertical sinusoids"),
+    "pairs least first": (
+        PAIRS,
+        moved([12, 13, 10, 11, 8, 9, 6, 7, 4, 5, 2, 3, 0, 1]),
+        "least significant bit first",
+    ),
+    "inverse after all": (
+        PAIRS,
+        moved([*range(0, 14, 2), *range(1, 14, 2)]),
+        "inverse frames come after all",
+    ),
+    "Gray code first": (
+        FOUR,
+        moved([*range(4, NINE), *range(4)]),
+        "order vertical Gray code, vertical sinusoids",
+    ),
     "rotated": (FOUR, lambda frames: np.roll(frames, 2, axis=0), "starts with frame"),
     "backward": (FOUR, lambda frames: frames[::-1], "all frames in the opposite order"),
-    "least bit first": (FOUR, moved([0, 1, 2, 3, *range(NINE - 1, 3, -1)]), "least significant bit first"),
+    "least bit first": (
+        FOUR,
+        moved([0, 1, 2, 3, *range(NINE - 1, 3, -1)]),
+        "least significant bit first",
+    ),
     "inverse": (FOUR, lambda frames: 255 - frames, "all frames inverted"),
-    "inverse bits": (FOUR, lambda frames: np.concatenate([frames[:4], 160 - frames[4:].clip(0, 160)]), "is inverted"),
+    "inverse bits": (
+        FOUR,
+        lambda frames: np.concatenate([frames[:4], 160 - frames[4:].clip(0, 160)]),
+        "is inverted",
+    ),
     "other sign": (FOUR, moved([0, 3, 2, 1, *range(4, NINE)]), "shifts of the other sign"),
     "mirrored": (FOUR, lambda frames: frames[:, :, ::-1], "mirrored left to right"),
     "turned": (FOUR, lambda frames: frames[:, ::-1, ::-1], "turned by 180 degrees"),
     "two frames exchanged": (UNIT, moved([0, 6, 2, 3, 4, 5, 1, 7]), "frames that changed places"),
-    "periods exchanged": (UNIT, moved([4, 5, 6, 7, 0, 1, 2, 3]), "of period 1, vertical sinusoids of period 0"),
+    "periods exchanged": (
+        UNIT,
+        moved([4, 5, 6, 7, 0, 1, 2, 3]),
+        "of period 1, vertical sinusoids of period 0",
+    ),
     "other sign of both": (UNIT, moved([0, 3, 2, 1, 4, 7, 6, 5]), "shifts of the other sign"),
     "sine for cosine": (UNIT, moved([1, 2, 3, 0, 5, 6, 7, 4]), "sine for cosine"),
 }
@@ -170,7 +202,10 @@ def test_two_directions_tell_more():
     for change, text in (
         (lambda f: f[[*range(8, 16), *range(8), 16, 17]], "order horizontal"),
         (lambda f: f[:, ::-1], "mirrored top to bottom"),
-        (lambda f: f[[*range(8), 8, 11, 10, 9, 12, 15, 14, 13, 16, 17]], "horizontal phase shifts of the other sign"),
+        (
+            lambda f: f[[*range(8), 8, 11, 10, 9, 12, 15, 14, 13, 16, 17]],
+            "horizontal phase shifts of the other sign",
+        ),
         (lambda f: f[[*range(16), 17, 16]], "white and black"),
     ):
         assert text in said(np.ascontiguousarray(change(frames)), rig)[0][1]
@@ -179,13 +214,19 @@ def test_two_directions_tell_more():
 def test_directions_of_different_codes_have_readings_of_their_own():
     """One without Gray code, and two with 5 and 8 bits: each is rearranged by its own code."""
     mixed = rig_of(
-        {"order": ["horizontal", "vertical"], "horizontal": UNIT | {"pitches_px": [1140, 57]}, "vertical": FOUR}
+        {
+            "order": ["horizontal", "vertical"],
+            "horizontal": UNIT | {"pitches_px": [1140, 57]},
+            "vertical": FOUR,
+        }
     )
     frames = frames_of(mixed)
     order = [*range(12), *range(16, 11, -1)]
     assert "vertical Gray code with the least" in said(frames[order], mixed)[0][1]
     fine = {"scheme": "phase-shift", "pitch_px": 16, "steps": 4, "gray": {}}
-    both = rig_of({"order": ["horizontal", "vertical"], "horizontal": fine, "vertical": FOUR}, size=400)
+    both = rig_of(
+        {"order": ["horizontal", "vertical"], "horizontal": fine, "vertical": FOUR}, size=400
+    )
     order = [0, 1, 2, 3, *range(11, 3, -1), 12, 13, 14, 15, *range(20, 15, -1)]
     text = said(frames_of(both)[order], both)[0][1]
     assert "another reading" in text and "Gray code with the least significant bit first" in text
@@ -194,7 +235,9 @@ def test_directions_of_different_codes_have_readings_of_their_own():
 def test_the_scene_of_two_captures_is_named():
     rig = rig_of(TWO)
     texture = 0.2 + 0.6 * (np.indices((SIZE, SIZE)).sum(axis=0) // 25 % 2)
-    one, other = (np.rint(frames_of(rig) * part).astype(np.uint8) for part in (texture, 1 - texture))
+    one, other = (
+        np.rint(frames_of(rig) * part).astype(np.uint8) for part in (texture, 1 - texture)
+    )
     assert said(one, rig) == []
     assert "scene moved" in [name for name, _ in said(np.concatenate([one[:8], other[8:]]), rig)]
 
@@ -238,7 +281,9 @@ def test_rows_that_show_another_pattern_are_named(steps, torn, first, last):
     rig = vertical(FOUR | {"steps": steps})
     frames, others = frames_of(rig), frames_of(rig, seed=1)
     index = steps + 2 if torn == "gray" else 1
-    frames[index, first : last + 1] = others[index + (1 if torn == "gray" else torn), first : last + 1]
+    frames[index, first : last + 1] = others[
+        index + (1 if torn == "gray" else torn), first : last + 1
+    ]
     ((name, text),) = said(frames, rig)
     assert name == "torn frames" and "differ from the other rows" in text
     start, end = text.split("rows ")[1].split(" differ")[0].split(" to ")
@@ -252,11 +297,16 @@ def test_rows_whose_frames_are_all_late_contradict_the_code():
     frames[1:, 140:] = frames_of(rig, seed=1)[:-1, 140:]
     frames[0, 140:] = 100
     ((name, text),) = said(frames, rig)
-    assert name == "contradictions" and "most in rows 138 to 199" in text and "no cause that was tried fits" in text
+    assert (
+        name == "contradictions"
+        and "most in rows 138 to 199" in text
+        and "no cause that was tried fits" in text
+    )
 
 
 def test_steps_that_are_equally_bright_where_fringes_hardly_run_are_no_tear():
-    """A period of the whole pattern: in a band all pixels have one phase, at which two steps may be equal."""
+    """A period of the whole pattern: in a band all pixels have one phase, at which two steps may be
+    equal."""
     rig = vertical({"scheme": "phase-shift", "pitches_px": [912, 57], "steps": 4})
     texture = 0.5 + 0.5 * (np.indices((SIZE, SIZE)).sum(axis=0) // 9 % 2)
     frames = np.rint(frames_of(rig) * texture).astype(np.uint8)
@@ -267,7 +317,10 @@ def test_steps_that_are_equally_bright_where_fringes_hardly_run_are_no_tear():
 def test_levels_that_pile_up_are_saturated_wherever_that_is(top):
     rig = vertical(FOUR)
     bright = np.stack(capture(rig, tilted(rig), albedo=1.2, noise=0.0)).astype(np.float64)
-    summed = sum(np.minimum(bright + np.random.default_rng(n).normal(0, 1, bright.shape), top) for n in range(10))
+    summed = sum(
+        np.minimum(bright + np.random.default_rng(n).normal(0, 1, bright.shape), top)
+        for n in range(10)
+    )
     levels = np.rint(summed).astype(np.float32) * np.float32(255 / 4095)
     assert examine(levels, rig).full_grey == levels.max()
     clipped = np.minimum(bright, top).astype(np.uint8)
@@ -280,10 +333,12 @@ def test_a_whole_crest_is_not_saturated(noise):
     assert examine(frames_of(rig, noise=noise), rig).full_grey == 255
 
 
-@pytest.mark.parametrize("turned, cause", [(0.0, "response"), (90.0, "no cause that was tried fits")])
+@pytest.mark.parametrize(
+    "turned, cause", [(0.0, "response"), (90.0, "no cause that was tried fits")]
+)
 def test_a_wave_that_no_response_makes_has_no_cause(turned, cause):
-    """Equal brightness looks alike at every pixel, so its waves are symmetric: a second harmonic turned against the
-    first comes from elsewhere."""
+    """Equal brightness looks alike at every pixel, so its waves are symmetric: a second harmonic
+    turned against the first comes from elsewhere."""
     rig = vertical(FOUR | {"steps": 3})
     frames = frames_of(rig)
     x, y = rig.camera.rays()

@@ -1,4 +1,5 @@
-"""The leaderboard: ranking, groups, the paper's rows, and what a hostile result file can do (nothing)."""
+"""The leaderboard: ranking, groups, the paper's rows, and what a hostile result file can do
+(nothing)."""
 
 import re
 from pathlib import Path
@@ -31,7 +32,9 @@ def elsewhere(tmp_path, monkeypatch):
 def make(tmp_path, dataset):
     """Score predictions off by ``offset_mm`` and write the result as ``file``."""
 
-    def act(file: str, offset_mm: float, split: str = "test", target: str = "depth", **changes) -> Path:
+    def act(
+        file: str, offset_mm: float, split: str = "test", target: str = "depth", **changes
+    ) -> Path:
         folder = tmp_path / "predictions" / file
         write_predictions(folder, dataset, split, offset_mm=offset_mm, **changes)
         path = tmp_path / "here" / file
@@ -53,12 +56,17 @@ def ranked(tmp_path, *arguments: object) -> list[dict]:
 
 def test_ranks_by_object_error_with_time_beside_it(make, tmp_path):
     worse = make("a.json", 4.0, name="Worse", seconds_per_sample=0.001, frames_used=[0, 1])
-    better = make("b.json", 1.0, name="Better", frames_used=[0, 1, 2], seconds_source="self-reported")
+    better = make(
+        "b.json", 1.0, name="Better", frames_used=[0, 1, 2], seconds_source="self-reported"
+    )
     out = board(worse, better)
     lines = [line for line in out.splitlines() if "Worse" in line or "Better" in line]
     assert re.search(r"Better.* 1\.000 .* 0\.25\* .* 3 ", lines[0])
     assert re.search(r"Worse.* 4\.000 .* 0\.001 .* 2 ", lines[1])
-    assert [row["name"] for row in ranked(tmp_path, worse, better)[0]["rows"]] == ["Better", "Worse"]
+    assert [row["name"] for row in ranked(tmp_path, worse, better)[0]["rows"]] == [
+        "Better",
+        "Worse",
+    ]
     by_time = ranked(tmp_path, worse, better, "--sort", "seconds_per_sample")[0]["rows"]
     assert [row["name"] for row in by_time] == ["Worse", "Better"]
     by_frames = ranked(tmp_path, better, worse, "--sort", "frames_used")[0]["rows"]
@@ -136,11 +144,17 @@ def test_paper_rows_are_the_papers():
         assert tuple(rows[table_and_row].errors_mm.values()) == errors
     mae = {row.row: row.errors_mm["object_mae_mm"] for row in tables["architecture"].rows}
     # "UNet ... outperforming TransUNet by 29%, ResUNet by 60%"
-    assert [round(100 * (mae[network] / mae["unet"] - 1)) for network in ("transunet", "resunet")] == [29, 60]
+    assert [
+        round(100 * (mae[network] / mae["unet"] - 1)) for network in ("transunet", "resunet")
+    ] == [29, 60]
     for (table, name), row in rows.items():
         ranged, masked = name not in ("raw", "global"), table == "background_removed"
         assert row.track == (
-            ("oracle range + mask" if masked else "oracle range") if ranged else "oracle mask" if masked else "metric"
+            ("oracle range + mask" if masked else "oracle range")
+            if ranged
+            else "oracle mask"
+            if masked
+            else "metric"
         )
         for pixels in ("overall", "object", "background"):
             assert 0 < row.errors_mm[f"{pixels}_mae_mm"] < row.errors_mm[f"{pixels}_rmse_mm"]
@@ -159,10 +173,15 @@ def test_probes_and_figures_of_the_paper():
         layers = paper_layers(probe)
         average = layers.pop(AVERAGE)
         for key in (above, below):
-            assert average[key] == pytest.approx(np.mean([row[key] for row in layers.values()]), abs=digit)
+            assert average[key] == pytest.approx(
+                np.mean([row[key] for row in layers.values()]), abs=digit
+            )
         assert average["ratio"] == pytest.approx(average[above] / average[below], abs=0.01)
     # "strongest in the final decoder layer", which is our dec1
-    assert max(paper_layers("grad_cam"), key=lambda name: paper_layers("grad_cam")[name]["r_edges"]) == "dec1"
+    assert (
+        max(paper_layers("grad_cam"), key=lambda name: paper_layers("grad_cam")[name]["r_edges"])
+        == "dec1"
+    )
     note = paper_tables()["loss"].note
     assert "power_drill" in note and "hybrid_l1_0.7 12.21" in note
     assert paper_tables()["multi_frame"].figure is None
@@ -174,7 +193,9 @@ def test_paper_tables_by_choice(choice, tmp_path):
     expected = paper_tables() if choice == "all" else () if choice == "none" else (choice,)
     for name in paper_tables():
         assert (f"{name}: " in out) == (name in expected)
-        assert (f"{name}&#58; ".replace("_", "&#95;") in (tmp_path / "t.md").read_text()) == (name in expected)
+        assert (f"{name}&#58; ".replace("_", "&#95;") in (tmp_path / "t.md").read_text()) == (
+            name in expected
+        )
     assert SHOWN_BY_DEFAULT == ("architecture", "normalization", "oracle_order")
 
 
@@ -186,7 +207,9 @@ def test_paper_rows_stay_out_of_the_ranking(make, tmp_path):
     assert [table["name"] for table in content["reported_by_others"]] == list(SHOWN_BY_DEFAULT)
 
 
-HOSTILE = "| a `b` <script>alert(1)</script> [x](http://e) ![i](y) **z** @me www.e.org &amp; \\| #1 [red]"
+HOSTILE = (
+    "| a `b` <script>alert(1)</script> [x](http://e) ![i](y) **z** @me www.e.org &amp; \\| #1 [red]"
+)
 
 
 def test_submitted_text_is_only_text(make, tmp_path):
@@ -222,7 +245,13 @@ def test_files_are_the_same_bytes_every_time(make, tmp_path):
     files = [make("a.json", 1.0, name="a"), make("b.json", 2.0, name="b")]
     for run in ("1", "2"):
         order = files if run == "1" else files[::-1]
-        arguments = [*map(str, order), "--markdown", str(tmp_path / f"{run}.md"), "--json", str(tmp_path / f"{run}.j")]
+        arguments = [
+            *map(str, order),
+            "--markdown",
+            str(tmp_path / f"{run}.md"),
+            "--json",
+            str(tmp_path / f"{run}.j"),
+        ]
         assert fpp_bench("leaderboard", *arguments) == 0
     assert (tmp_path / "1.md").read_bytes() == (tmp_path / "2.md").read_bytes()
     assert (tmp_path / "1.j").read_bytes() == (tmp_path / "2.j").read_bytes()
@@ -251,7 +280,10 @@ def test_the_files_that_this_package_writes_are_told_apart(tiny, make, capsys):
         capsys.readouterr()
         error = refusal(fpp_bench, "leaderboard", first, path)
         assert error.count("\n") == 1 and f"{path} is not a result file but {what}" in error
-    for words in (["compare", str(first), "board.json"], ["verify", "board.json", "predictions", "data"]):
+    for words in (
+        ["compare", str(first), "board.json"],
+        ["verify", "board.json", "predictions", "data"],
+    ):
         assert "board.json is not a result file but a ranking" in refusal(fpp_eval, *words)
     board(first, "--row", "row.json")
     assert fpp_eval("compare", "row.json", second) == 0
@@ -262,7 +294,8 @@ def test_named_results_are_shown_without_tables_of_others(make):
     out = board(first)
     assert "Reported by others" not in out and out.count("┡") == 1
     assert out.endswith(
-        "Not shown: 3 tables that others reported on other data (--paper all), and the leaderboard's own 0 rows "
+        "Not shown: 3 tables that others reported on other data (--paper all), and the "
+        "leaderboard's own 0 rows "
         "(fpp-bench leaderboard without a file).\n"
     )
     assert out.count("Not shown") == 1
@@ -277,10 +310,14 @@ def test_repetition_is_refused(make, tmp_path):
     first, second = make("first.json", 1.0), make("second.json", 2.0)
     message = refusal(fpp_bench, "leaderboard", first, second)
     assert "first.json" in message and "second.json" in message and "another name" in message
-    assert "given twice" in refusal(fpp_bench, "leaderboard", first, first.parent / ".." / "here" / "first.json")
+    assert "given twice" in refusal(
+        fpp_bench, "leaderboard", first, first.parent / ".." / "here" / "first.json"
+    )
     (tmp_path / "empty").mkdir()
     assert "found none" in refusal(fpp_bench, "leaderboard", tmp_path / "empty")
-    assert "nowhere.json: can't be read: No such file" in refusal(fpp_bench, "leaderboard", "nowhere.json")
+    assert "nowhere.json: can't be read: No such file" in refusal(
+        fpp_bench, "leaderboard", "nowhere.json"
+    )
 
 
 def test_shipped_rows_are_sound():
@@ -288,7 +325,9 @@ def test_shipped_rows_are_sound():
     files = sorted(SHIPPED.glob("*.json"))
     groups = ranking.rank(ranking.read_entries(files))
     shown = sum(1 + (row.unseen is not None) for group in groups for row in group.rows)
-    assert shown + sum("same predictions" in note for group in groups for note in group.notes) == len(files)
+    assert shown + sum(
+        "same predictions" in note for group in groups for note in group.notes
+    ) == len(files)
 
 
 def test_unwritable_output_is_an_error(make, tmp_path):
@@ -299,11 +338,16 @@ def test_unwritable_output_is_an_error(make, tmp_path):
 
 @pytest.mark.parametrize("width", [80, 100, 300])
 def test_numbers_stay_whole_in_narrow_terminals(width, make, monkeypatch):
-    path = make("a.json", 1234.5, name="A rather long name of a method, with both directions and 18 steps")
+    path = make(
+        "a.json", 1234.5, name="A rather long name of a method, with both directions and 18 steps"
+    )
     monkeypatch.setenv("COLUMNS", str(width))
     out = board(path, "--sort", "object_edge_mae_mm", "--paper", "none")
     assert all(len(line) <= width for line in out.splitlines())
-    assert f"│ {cut_at_word('A rather long name of a method, with both directions and 18 steps')} │" in out
+    assert (
+        f"│ {cut_at_word('A rather long name of a method, with both directions and 18 steps')} │"
+        in out
+    )
     assert out.count("1234.500") == {80: 2, 100: 3, 300: 6}[width]
     header = out.split("┡")[0]
     assert "Edge" in header, "the rows are sorted by it"

@@ -12,7 +12,14 @@ from upkeep import readme_block
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.leaderboard.columns import CODE, assumption, assumption_sentences
 from fpp_ml_bench.leaderboard.page.page import page_files
-from fpp_ml_bench.leaderboard.ranking import LONGEST_NAME, cut_at_word, rank, read_entries, shipped_rows, short_names
+from fpp_ml_bench.leaderboard.ranking import (
+    LONGEST_NAME,
+    cut_at_word,
+    rank,
+    read_entries,
+    shipped_rows,
+    short_names,
+)
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
 
 
@@ -22,13 +29,21 @@ def shipped():
 
 
 def test_shipped_rows_stay_sorted_by_rank_and_error(shipped):
-    """Of two rows that the tests don't tell apart, the one that fewer others may be ahead of comes first."""
+    """Of two rows that the tests don't tell apart, the one that fewer others may be ahead of comes
+    first."""
     for group in rank(shipped):
-        keys = [(row.best_rank or 0, row.worst_rank or 0, row.value(row.rank_key)) for row in group.rows]
+        keys = [
+            (row.best_rank or 0, row.worst_rank or 0, row.value(row.rank_key)) for row in group.rows
+        ]
         assert keys == sorted(keys)
         unranked = [error for best, _, error in keys if not best]
         assert unranked in ([], [error for _, _, error in keys])  # all or none
-        told_apart = [(first, second) for first in keys for second in keys if first[0] and first[1] < second[0]]
+        told_apart = [
+            (first, second)
+            for first in keys
+            for second in keys
+            if first[0] and first[1] < second[0]
+        ]
         assert all(first[2] < second[2] for first, second in told_apart)
 
 
@@ -38,7 +53,9 @@ def with_content(entry, digit):
 
 
 def test_groups_are_headed_by_their_benchmark_and_other_data_come_last(files, monkeypatch):
-    entry = changed(read_entries(files[:1])[0], submission={"frames_used": [0]}, frames_class="one frame")
+    entry = changed(
+        read_entries(files[:1])[0], submission={"frames_used": [0]}, frames_class="one frame"
+    )
     named = with_content(entry, "a")
     named_benchmarks(monkeypatch, full=named.row.dataset.content, unseen={})
     groups = rank([entry, named])
@@ -50,7 +67,9 @@ def test_groups_are_headed_by_their_benchmark_and_other_data_come_last(files, mo
     ]
     block, index = readme_block(groups), page_files(groups, [])["index.html"].decode()
     assert index.index("fpp-bench-full version 2") < index.index(truth)
-    assert "fpp-bench-full version 2" in block and truth not in block  # README shows the first dataset
+    assert (
+        "fpp-bench-full version 2" in block and truth not in block
+    )  # README shows the first dataset
 
 
 def test_a_table_is_of_scenes_whatever_was_projected(files):
@@ -65,7 +84,8 @@ def test_a_table_is_of_scenes_whatever_was_projected(files):
 
 
 def test_the_data_that_is_not_shown_first(shipped):
-    """Lights that nothing is trained in, and small images: on the page in one line, in README not at all."""
+    """Lights that nothing is trained in, and small images: on the page in one line, in README not
+    at all."""
     special = {group.key.benchmark.name: group.key.special_data for group in rank(shipped)}
     assert special == {
         "fpp-bench-full": "",
@@ -82,7 +102,9 @@ def test_short_names_of_shipped_rows(shipped):
     for group in rank(shipped):
         shown = [row.short_name for row in group.rows]
         assert len(set(shown)) == len(shown)
-        assert all(len(name) <= LONGEST_NAME and "…" not in name and "(" not in name for name in shown)
+        assert all(
+            len(name) <= LONGEST_NAME and "…" not in name and "(" not in name for name in shown
+        )
         names |= {row.entry.path.stem: row.short_name for row in group.rows}
     expected = {
         "phase-03-vertical": "Phase, 3 vertical",
@@ -130,8 +152,18 @@ UNET = {
         ("A better phase route", "phase", {}, "A better phase route"),
         ("UNet, mine", "unet", {"network": "unet", "loss": "hybrid_l1_x"}, "UNet, mine"),
         ("UNet, global, rmse", "unet", UNET, "UNet global RMSE"),
-        ("UNet, global, rmse", "unet", UNET | {"trained_frames": "all"}, "UNet global RMSE all frames"),
-        ("UNet, global, rmse", "unet", UNET | {"background_removed": True}, "UNet global RMSE, no background"),
+        (
+            "UNet, global, rmse",
+            "unet",
+            UNET | {"trained_frames": "all"},
+            "UNet global RMSE all frames",
+        ),
+        (
+            "UNet, global, rmse",
+            "unet",
+            UNET | {"background_removed": True},
+            "UNet global RMSE, no background",
+        ),
         ("UNet, global, rmse, input standardised", "unet", UNET, "UNet global RMSE, standardised"),
     ],
 )
@@ -141,7 +173,8 @@ def test_only_rows_of_the_packages_methods_get_a_name_from_settings(name, method
 
 
 def test_a_stranger_does_not_get_the_name_of_a_built_in_method():
-    """Who only claims to be one keeps the own name, behind those who are; names that look the same get a number."""
+    """Who only claims to be one keeps the own name, behind those who are; names that look the same
+    get a number."""
     settings = {"direction": "vertical", "frames": 1, "shading": True, "prior": "none"}
     measured = submission("Phase route, one frame", "phase", **settings)
     claims = submission("Phase route, mine and better", "phase", **settings)
@@ -164,7 +197,10 @@ def test_short_names_of_a_group_differ_whatever_the_names(names):
 
 
 def test_a_long_name_is_cut_at_a_word():
-    assert cut_at_word("A fringe network with attention, trained on everything") == "A fringe network with attention…"
+    assert (
+        cut_at_word("A fringe network with attention, trained on everything")
+        == "A fringe network with attention…"
+    )
     assert cut_at_word("x" * 50) == "x" * (LONGEST_NAME - 1) + "…"
     assert cut_at_word("short enough") == "short enough"
 
@@ -174,7 +210,10 @@ ASSUMED = {
     "constant-range-middle-224": ("", "Given the test sample's depth range."),
     "crossed-03": ("known range and wall", "the wall behind it, whose distance the rig states"),
     "phase-horizontal-36px": ("known range", "the fringe has one period at most"),
-    "phase-vertical": ("one albedo, a lit background", "one albedo for all surfaces and a lit background"),
+    "phase-vertical": (
+        "one albedo, a lit background",
+        "one albedo for all surfaces and a lit background",
+    ),
     "phase-net-any-vertical": ("a lit background", "a lit background; not one albedo"),
 }
 
@@ -188,4 +227,6 @@ def test_rows_say_what_they_assume(stem):
     assert bool(assumption_sentences(entry.row)) == bool(sentence)
     pages = page_files(rank([entry]), [])
     assert words in pages["index.html"].decode()
-    assert all(sentence in unescape(own.decode()) for name, own in pages.items() if "submissions" in name)
+    assert all(
+        sentence in unescape(own.decode()) for name, own in pages.items() if "submissions" in name
+    )

@@ -57,14 +57,19 @@ def write_row_of(result: Path, path: Path) -> Path:
 def test_one_command_makes_a_row_and_prints_the_line_to_vouch_for_it(files, tmp_path, listed):
     row = tmp_path / "row.json"
     said, line = printed(fpp_bench, "leaderboard", files[0], "--row", row).splitlines()
-    assert said.startswith(f"{row}: {row.stat().st_size:,} bytes, self-reported until a maintainer adds")
+    assert said.startswith(
+        f"{row}: {row.stat().st_size:,} bytes, self-reported until a maintainer adds"
+    )
     entry, bare = read_entry(row), read_entry(files[0])
     assert entry.row == bare.row and entry.provenance == bare.provenance == rows.LOCAL
     write_row(entry.row, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == row.read_bytes()
     listed("# a remark")
     listed(line)
-    assert read_entry(row).provenance == "measured here" and read_entry(tmp_path / "again.json").vouched
+    assert (
+        read_entry(row).provenance == "measured here"
+        and read_entry(tmp_path / "again.json").vouched
+    )
     row.write_bytes(row.read_bytes() + b" ")
     assert read_entry(row).provenance == rows.LOCAL
 
@@ -81,26 +86,38 @@ def test_what_a_row_keeps_of_a_result(files):
         assert own.object_pixels == sum(sample.object_pixels for sample in samples)
         assert own.object_mae_mm == float(f"{part.metrics.object_mae_mm:.5g}")
     about = row.submission
-    assert (about.seconds_per_sample, about.hardware) == (None, None) and about.timing == result.submission.timing
+    assert (about.seconds_per_sample, about.hardware) == (
+        None,
+        None,
+    ) and about.timing == result.submission.timing
     hashes = "\n".join(sorted(sample.prediction_sha256 for sample in result.per_sample))
     assert row.predictions_sha256 == sha256(hashes.encode()).hexdigest()
     assert row.result_sha256 == sha256(files[1].read_bytes()).hexdigest()
 
 
 def test_means_weigh_objects_by_the_views_that_have_them(tmp_path):
-    """Objects that fill the image in some of their views: what is over objects is what is over samples."""
+    """Objects that fill the image in some of their views: what is over objects is what is over
+    samples."""
 
     def scene(number):
         depth = disk_depth((32, 40), number)
-        return np.zeros(depth.shape, np.uint8), depth if number % 3 else np.full_like(depth, 1800.0 + number)
+        return np.zeros(depth.shape, np.uint8), depth if number % 3 else np.full_like(
+            depth, 1800.0 + number
+        )
 
     dataset = make_dataset(tmp_path / "tiny", views=("A0", "A60", "A120"), scene=scene)
     path = write_result_file(tmp_path / "r.json", dataset, 1.0, 3.0)
     row, result = read_entry(path).row, read_result(path)
-    assert result.samples_without_background == 2 and [p.without_background for p in row.per_object] == [1, 1]
+    assert result.samples_without_background == 2 and [
+        p.without_background for p in row.per_object
+    ] == [1, 1]
     for key in HEADLINE:
-        assert mean_over(row.per_object, key) == pytest.approx(getattr(result.metrics, key), rel=1e-4)
-        assert interval_over(row.per_object, key) == pytest.approx(result.intervals.of(key), rel=1e-4)
+        assert mean_over(row.per_object, key) == pytest.approx(
+            getattr(result.metrics, key), rel=1e-4
+        )
+        assert interval_over(row.per_object, key) == pytest.approx(
+            result.intervals.of(key), rel=1e-4
+        )
     write_row(row, tmp_path / "row.json")
     assert read_entry(tmp_path / "row.json").row == row
 
@@ -118,7 +135,9 @@ def test_means_weigh_objects_by_the_views_that_have_them(tmp_path):
 def test_a_bad_line_of_the_list_is_named(line, listed, files):
     listed("")
     listed(line.format(sha="a" * 64, commit="b" * 40))
-    with pytest.raises(SubmissionError, match=r"vouched\.txt, line 2: expected SHA-256 of a row file"):
+    with pytest.raises(
+        SubmissionError, match=r"vouched\.txt, line 2: expected SHA-256 of a row file"
+    ):
         read_entry(files[0])
 
 
@@ -136,16 +155,22 @@ def test_fpp_eval_compares_results_and_rows(files, tmp_path, capsys):
     of_results, *of_rows = capsys.readouterr().out.split("first:")[1:]
     assert "samples" in of_results and all("of 2 objects" in text for text in of_rows)
     assert of_rows[0].strip() == of_rows[1].strip() and "sign-flip test" in of_rows[0]
-    lines = [re.search(r"object MAE.*", text)[0].split("│")[:3] for text in (of_results, of_rows[0])]
+    lines = [
+        re.search(r"object MAE.*", text)[0].split("│")[:3] for text in (of_results, of_rows[0])
+    ]
     assert lines[0] == lines[1]
 
 
 def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, capsys):
-    row, predictions = write_row_of(files[0], tmp_path / "row.json"), files[0].parent / "fast-predictions"
+    row, predictions = (
+        write_row_of(files[0], tmp_path / "row.json"),
+        files[0].parent / "fast-predictions",
+    )
     words = ["verify", str(row), str(predictions), str(dataset.path)]
     assert printed(fpp_eval, *words) == (
         f"verified: {row} is what 4 predictions give\n"
-        "not checked: run time and its machine, software, code and environment: predictions don't tell them\n"
+        "not checked: run time and its machine, software, code and environment: predictions don't "
+        "tell them\n"
     )
     content = read_json(row)
     content["metrics"]["object_median_mm"] += 2e-4
@@ -194,7 +219,9 @@ def test_a_mean_may_differ_by_what_five_digits_leave_open(stored, computed, agre
         (None, "self-reported", False),
     ],
 )
-def test_what_only_its_author_measured_is_marked(block, provenance, measured, dataset, tmp_path, listed, monkeypatch):
+def test_what_only_its_author_measured_is_marked(
+    block, provenance, measured, dataset, tmp_path, listed, monkeypatch
+):
     """Time, phase reliance and robustness of a stranger's row, whatever the row says."""
     monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path)
     result = write_result_file(tmp_path / "r.json", dataset, 1.0, timing=block)
@@ -245,12 +272,24 @@ def test_unsound_rows_are_refused_by_name(change, message, one_frame, tmp_path):
     [
         ("metrics.object_mae_mm", 1.0, "metrics.object_mae_mm does not follow from per_object"),
         ("metrics.object_mae_mm", None, "metrics.object_mae_mm does not follow from per_object"),
-        ("intervals.object_mae_mm", [4.0, 4.1], "intervals.object_mae_mm does not follow from per_object"),
+        (
+            "intervals.object_mae_mm",
+            [4.0, 4.1],
+            "intervals.object_mae_mm does not follow from per_object",
+        ),
         ("intervals.overall_rmse_mm", [None, None], "intervals.overall_rmse_mm does not follow"),
         ("per_object.0.object", "wooden_boards", "names an object twice"),
         ("per_object.0.samples", 1, "do not add up"),
-        ("per_object.0.void_pixels", 1, "object, background and void pixels do not add up to 2 images"),
-        ("per_object.0.object_mae_mm", None, "object scores must be null exactly when the set is empty"),
+        (
+            "per_object.0.void_pixels",
+            1,
+            "object, background and void pixels do not add up to 2 images",
+        ),
+        (
+            "per_object.0.object_mae_mm",
+            None,
+            "object scores must be null exactly when the set is empty",
+        ),
         ("per_object.0.object_rmse_mm", 0.1, "object RMSE is below its MAE"),
         ("per_object.0.without_object", 2, "or no view has the set"),
         ("dataset.samples", 5, "per_object holds 4 samples, dataset.samples says 5"),
@@ -272,25 +311,38 @@ def test_a_row_is_of_one_result_and_small(files, dataset, tmp_path):
     assert "a row of one result, 2 were given" in refusal(
         fpp_bench, "leaderboard", *files[:2], "--row", tmp_path / "r.json"
     )
-    large = write_result_file(tmp_path / "l.json", dataset, 1.0, settings={f"key {n}": "x" * 90 for n in range(150)})
-    assert "r.json: the row has" in refusal(fpp_bench, "leaderboard", large, "--row", tmp_path / "r.json")
+    large = write_result_file(
+        tmp_path / "l.json", dataset, 1.0, settings={f"key {n}": "x" * 90 for n in range(150)}
+    )
+    assert "r.json: the row has" in refusal(
+        fpp_bench, "leaderboard", large, "--row", tmp_path / "r.json"
+    )
     assert not (tmp_path / "r.json").exists()
     path = write_row_of(files[0], tmp_path / "padded.json")
     path.write_bytes(path.read_bytes() + b" " * 12_000)
     assert "padded.json: the row has" in refusal(fpp_bench, "leaderboard", path)
-    assert "can't be written" in refusal(fpp_bench, "leaderboard", files[0], "--row", tmp_path / "no" / "r.json")
+    assert "can't be written" in refusal(
+        fpp_bench, "leaderboard", files[0], "--row", tmp_path / "no" / "r.json"
+    )
 
 
 def test_more_within_a_tolerance_is_better(dataset, tmp_path):
-    paths = [write_result_file(tmp_path / f"{o}.json", dataset, o, name=f"off by {o}") for o in (0.5, 3.0, 20.0)]
+    paths = [
+        write_result_file(tmp_path / f"{o}.json", dataset, o, name=f"off by {o}")
+        for o in (0.5, 3.0, 20.0)
+    ]
     ranked = rank(read_entries(paths), "object_within_5mm_share")[0].rows
     assert [row.entry.name for row in ranked][-1] == "off by 20.0"
 
 
-@pytest.mark.parametrize("key", [key for key, metric in METRICS.items() if metric.helped_by_missing])
+@pytest.mark.parametrize(
+    "key", [key for key, metric in METRICS.items() if metric.helped_by_missing]
+)
 def test_no_rank_by_what_missing_pixels_improve(key, dataset, tmp_path):
     path = write_result_file(tmp_path / "a.json", dataset, 1.0)
-    assert "a method could lead by answering few pixels" in refusal(fpp_bench, "leaderboard", path, "--sort", key)
+    assert "a method could lead by answering few pixels" in refusal(
+        fpp_bench, "leaderboard", path, "--sort", key
+    )
     with pytest.raises(SubmissionError, match=key):
         rank(read_entries([path]), key)
 
@@ -304,7 +356,8 @@ def test_unnamed_results_do_not_get_into_a_page(files, tmp_path, monkeypatch):
 
 
 def test_shipped_rows_and_the_list_fit_each_other():
-    """Each row is a row file that is listed or self-reported, each line of the list is one of theirs."""
+    """Each row is a row file that is listed or self-reported, each line of the list is one of
+    theirs."""
     entries = read_entries(shipped_rows())
     hashes = [sha256(entry.path.read_bytes()).hexdigest() for entry in entries]
     assert entries and len(set(hashes)) == len(hashes) and set(rows.vouched()) <= set(hashes)

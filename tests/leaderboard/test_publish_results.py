@@ -1,4 +1,5 @@
-"""The leaderboard's page as a static Space, results in a model's repository, and what decides which file is sent."""
+"""The leaderboard's page as a static Space, results in a model's repository, and what decides which
+file is sent."""
 
 import json
 
@@ -38,12 +39,20 @@ def scored(client, tmp_path_factory):
     for name, data, split, target, changed in (
         ("good", dataset, "test", "depth", {"name": HOSTILE, "seconds_source": "self-reported"}),
         ("better", dataset, "test", "depth", {"offset_mm": 1.0}),
-        ("many", dataset, "test", "depth", {"frames_used": list(range(18)), "uses_ground_truth_range": True}),
+        (
+            "many",
+            dataset,
+            "test",
+            "depth",
+            {"frames_used": list(range(18)), "uses_ground_truth_range": True},
+        ),
         ("other", small, "test", "depth", {}),
         ("train", dataset, "train", "depth", {}),
         ("exact", dataset, "test", "depth_exact", {}),
     ):
-        predictions = write_predictions(folder / "predictions" / name, data, split, **{"offset_mm": 10.0, **changed})
+        predictions = write_predictions(
+            folder / "predictions" / name, data, split, **{"offset_mm": 10.0, **changed}
+        )
         results[name] = folder / f"{name}.json"
         write_result(evaluate(predictions, data, split, target), results[name])
     return results
@@ -57,7 +66,9 @@ def entry(client, repo: str, task: str):
 
 
 def test_results_parse_back(client, scored):
-    client.server.repos["models", "alice/unet"] = Repo(files={"README.md": b"card", ".eval_results/hle.yaml": b"[]"})
+    client.server.repos["models", "alice/unet"] = Repo(
+        files={"README.md": b"card", ".eval_results/hle.yaml": b"[]"}
+    )
     call = ["results", str(scored["good"]), str(scored["many"]), "--repo", "alice/unet"]
     call += ["--dataset-repo", "alice/scored"]
     client.server.writes()
@@ -74,7 +85,10 @@ def test_results_parse_back(client, scored):
     )
     ((status, alone, error),) = client.run([*call, "--dry-run"], HF_HUB_OFFLINE="1")
     assert status == 0 and listed(alone) == listed(dry), error
-    assert "HF_HUB_OFFLINE is set" in alone and "not compared with the content of alice/scored" in alone
+    assert (
+        "HF_HUB_OFFLINE is set" in alone
+        and "not compared with the content of alice/scored" in alone
+    )
     repo = client.server.repos["models", "alice/unet"]
     assert repo.files["README.md"] == b"card" and repo.files[".eval_results/hle.yaml"] == b"[]"
     single = entry(client, "alice/unet", "single_shot_depth")
@@ -84,21 +98,31 @@ def test_results_parse_back(client, scored):
     assert (single.dataset_id, single.task_id) == ("alice/scored", "single_shot_depth")
     assert single.dataset_revision == client.server.repos["datasets", "alice/scored"].commits[-1]
     assert single.date == result["created"][:10]
-    assert (single.source_url, single.source_name) == ("https://example.org/page", "FPP-ML-Bench leaderboard")
+    assert (single.source_url, single.source_name) == (
+        "https://example.org/page",
+        "FPP-ML-Bench leaderboard",
+    )
     assert "Object MAE 10.000 mm" in single.notes and "higher is better" in single.notes
     assert "metric track, 1 frame" in single.notes and "self-reported" in single.notes
     assert HOSTILE not in single.notes and "script" not in single.notes
-    assert "oracle range track, 18 frames" in entry(client, "alice/unet", "multi_frame_depth_oracle_range").notes
+    assert (
+        "oracle range track, 18 frames"
+        in entry(client, "alice/unet", "multi_frame_depth_oracle_range").notes
+    )
 
 
 def test_a_second_run_sends_nothing_and_a_better_result_replaces(client, scored):
     client.server.repos["models", "alice/mlp"] = Repo()
     call = ["--repo", "alice/mlp", "--dataset-repo", "alice/scored"]
-    first, second, better = client.run(*(["results", str(scored[name]), *call] for name in ("good", "good", "better")))
+    first, second, better = client.run(
+        *(["results", str(scored[name]), *call] for name in ("good", "good", "better"))
+    )
     assert first[0] == second[0] == better[0] == 0
     assert "Nothing to send" in second[1]
     assert list(listed(better[1]).values()) == ["changed"]
-    assert entry(client, "alice/mlp", "single_shot_depth").value == pytest.approx(100 / 1.1, abs=1e-4)
+    assert entry(client, "alice/mlp", "single_shot_depth").value == pytest.approx(
+        100 / 1.1, abs=1e-4
+    )
     assert len(client.server.repos["models", "alice/mlp"].commits) == 3
 
 
@@ -119,7 +143,9 @@ def test_results_that_belong_to_no_task_are_refused(client, scored, tmp_path):
         ([*call[:-1], "alice/nowhere", str(scored["good"])], "no such dataset"),
     ]
     client.server.writes()
-    for (arguments, message), (status, _, error) in zip(cases, client.run(*(case for case, _ in cases)), strict=True):
+    for (arguments, message), (status, _, error) in zip(
+        cases, client.run(*(case for case, _ in cases)), strict=True
+    ):
         assert status == 2 and message in error and "Traceback" not in error, (arguments, error)
     assert client.server.writes() == []
 
@@ -141,7 +167,11 @@ def test_the_page_becomes_a_static_space(client, scored, tmp_path):
     space = client.server.repos["spaces", "alice/board"]
     assert space.sdk == "static" and len(space.commits) == 3
     head = yaml.safe_load(space.files["README.md"].decode().split("---\n")[1])
-    assert (head["sdk"], head["app_file"], head["datasets"]) == ("static", "index.html", ["alice/scored"])
+    assert (head["sdk"], head["app_file"], head["datasets"]) == (
+        "static",
+        "index.html",
+        ["alice/scored"],
+    )
     assert len(head["short_description"]) <= 60  # the Hub refuses more
     files = {".gitattributes", "README.md", "fpp-bench.json", "index.html", "data.json", "data.csv"}
     assert set(space.files) == {*files, *pages} - deleted
@@ -160,7 +190,9 @@ def test_repository_names(name):
     assert check_repo_name(name) == name
 
 
-@pytest.mark.parametrize("name", ["a", "a/b/c", "/b", "a/b c", "a/..", "a/b--c", "a/b.git", "a/-b", "a/b\n", "ä/b"])
+@pytest.mark.parametrize(
+    "name", ["a", "a/b/c", "/b", "a/b c", "a/..", "a/b--c", "a/b.git", "a/-b", "a/b\n", "ä/b"]
+)
 def test_no_repository_names(name):
     with pytest.raises(PublishError, match="OWNER/NAME"):
         check_repo_name(name)
@@ -177,7 +209,11 @@ def test_preview_is_white_where_near():
     depth[100:400, 50:250] = np.linspace(1800, 1900, 300, dtype=np.float32)[:, None]
     small = preview(depth)
     assert small.shape == (167, 100) and small.dtype == np.uint8
-    assert (small[depth[::3, ::3] == 0] == 0).all() and small.max() > 250 and small[small > 0].min() >= 64
+    assert (
+        (small[depth[::3, ::3] == 0] == 0).all()
+        and small.max() > 250
+        and small[small > 0].min() >= 64
+    )
     column = small[:, 50][small[:, 50] > 0].astype(int)
     assert (np.diff(column) <= 0).all()
     assert not preview(np.zeros((4, 4), dtype=np.float32)).any()

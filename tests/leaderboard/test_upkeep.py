@@ -27,19 +27,26 @@ BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Results of one frame, one of which was told the range, two of a full sequence, and one of few frames."""
+    """Results of one frame, one of which was told the range, two of a full sequence, and one of few
+    frames."""
     work = tmp_path_factory.mktemp("rows")
     dataset, made = make_dataset(work / "tiny"), []
     for name, offset_mm, about in (
         ("Fast and rough", 4.0, {"frames_used": [0], "timing": timing(2.0)}),
         ("Slow and fine", 0.5, {"frames_used": [0], "timing": timing(50.0)}),
-        ("Beaten", 8.0, {"frames_used": [0], "seconds_per_sample": 0.08, "seconds_source": "self-reported"}),
+        (
+            "Beaten",
+            8.0,
+            {"frames_used": [0], "seconds_per_sample": 0.08, "seconds_source": "self-reported"},
+        ),
         ("Was told", 0.1, {"frames_used": [0], "uses_ground_truth_range": True}),
         ("Classical, best", 0.2, {"frames_used": [*range(50)], "method": "classical"}),
         ("Classical, worse", 0.3, {"frames_used": [*range(50)], "method": "classical"}),
         ("Few", 0.1, {"frames_used": [0, 1]}),
     ):
-        made.append(write_result_file(work / f"{name}.json", dataset, offset_mm, 0.1, name=name, **about))
+        made.append(
+            write_result_file(work / f"{name}.json", dataset, offset_mm, 0.1, name=name, **about)
+        )
     return made
 
 
@@ -68,7 +75,9 @@ def test_readme_block_is_made_and_stays(readme, files, capsys):
 def test_readme_shows_the_best_of_a_group(files):
     count, entry = SHOWN + 4, read_entry(files[0])
     named = [
-        changed(entry, submission={"name": f"Method {number:02}"}, predictions_sha256=f"{number:064}")
+        changed(
+            entry, submission={"name": f"Method {number:02}"}, predictions_sha256=f"{number:064}"
+        )
         for number in range(count)
     ]
     text = readme_block(rank([*named, *map(read_entry, files[3:])]))
@@ -93,7 +102,10 @@ def test_readme_of_the_shipped_rows_is_one_short_table():
         "Without whole periods",
         "Disturbed, mm",
     ]
-    frames, errors = [int(row[6]) for row in rows[2:]], [float(row[2].split()[0]) for row in rows[2:]]
+    frames, errors = (
+        [int(row[6]) for row in rows[2:]],
+        [float(row[2].split()[0]) for row in rows[2:]],
+    )
     assert frames[:-1] == [1] * SHOWN and frames[-1] > 36 and errors[:-1] == sorted(errors[:-1])
     assert rows[2][2] == "2.588 (1.871 to 3.400)" and rows[2][3] == "1.225"
     assert "150 samples of 25 objects" in text and len(text.encode()) < 2048
@@ -103,10 +115,16 @@ def test_readme_of_the_shipped_rows_is_one_short_table():
 def test_a_hand_edited_block_fails_the_check_and_is_left_alone(readme, files, capsys):
     assert block(readme, files) == 0
     made = readme.read_text()
-    for edited in (made.replace("| Slow", "| Slowest"), made.replace(END, f"A line too many.\n{END}")):
+    for edited in (
+        made.replace("| Slow", "| Slowest"),
+        made.replace(END, f"A line too many.\n{END}"),
+    ):
         readme.write_text(edited)
         assert block(readme, files, check=True) == 1
-        assert "don't edit it by hand, run: python benchmarks/upkeep.py readme" in capsys.readouterr().err
+        assert (
+            "don't edit it by hand, run: python benchmarks/upkeep.py readme"
+            in capsys.readouterr().err
+        )
         assert readme.read_text() == edited
     readme.write_text(made.replace("More.", "Text outside of the markers."))
     assert block(readme, files, check=True) == 0
@@ -156,8 +174,15 @@ def test_a_row_stays_vouched_for_when_more_of_it_is_measured(files, tmp_path, mo
         return 0
 
     monkeypatch.setattr(upkeep, "fpp_bench", measure)
-    assert upkeep.main(["measured", str(row), "reliance", "phase", "data/full", "--direction", "vertical"]) == 0
-    assert ran == [["reliance", "phase", "data/full", "--direction", "vertical", "--into", str(row)]]
+    assert (
+        upkeep.main(
+            ["measured", str(row), "reliance", "phase", "data/full", "--direction", "vertical"]
+        )
+        == 0
+    )
+    assert ran == [
+        ["reliance", "phase", "data/full", "--direction", "vertical", "--into", str(row)]
+    ]
     after = sha256(row.read_bytes()).hexdigest()
     assert after != before and (tmp_path / "vouched.txt").read_text() == f"{after} | measured\n"
 
@@ -171,12 +196,16 @@ def test_the_page_of_commands_is_made_of_them(tmp_path, capsys):
     text = page.read_text()
     for program in (BENCH, EVAL):
         assert all(f"**`{program.name} {name} " in text for name in program.commands)
-    assert "fpp-eval predictions --json result.json\n" in text and "# plain load_dataset opens" in text
+    assert (
+        "fpp-eval predictions --json result.json\n" in text and "# plain load_dataset opens" in text
+    )
 
 
 def test_the_tables_of_robustness_stand_between_their_markers(tmp_path):
     assert all(
-        f"<!-- {name}:{end} -->" in upkeep.ROBUSTNESS.read_text() for name in upkeep.SETS for end in ("begin", "end")
+        f"<!-- {name}:{end} -->" in upkeep.ROBUSTNESS.read_text()
+        for name in upkeep.SETS
+        for end in ("begin", "end")
     )
     page = tmp_path / "page.md"
     page.write_text("a page without them")
@@ -206,12 +235,15 @@ def test_the_tables_of_robustness_stand_between_their_markers(tmp_path):
     )
     results = [
         SimpleNamespace(
-            submission=SimpleNamespace(name="A | method", method="mine", settings={}), robustness={"test": block}
+            submission=SimpleNamespace(name="A | method", method="mine", settings={}),
+            robustness={"test": block},
         )
     ]
     assert upkeep.of_set("unseen", results) == []
     table = upkeep.robustness_tables(upkeep.of_set("test", results))
-    assert "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 | 3.0* | 3.0 |" in table.replace("&#42;", "*")
+    assert "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 | 3.0* | 3.0 |" in table.replace(
+        "&#42;", "*"
+    )
     assert "Not in the mean: dark-paint, dark-wall." in table
 
 
@@ -225,7 +257,9 @@ def test_what_is_older_than_its_row_is_found(monkeypatch):
     metrics = read_entry(SHIPPED_ROWS / "crossed.json").row.metrics
     right = f"{metrics.object_mae_mm:.2f} / {metrics.two_sided_mae_mm:.1f}"
     assert shown_rows.wrong_figures(figure.format(right)) == []
-    assert shown_rows.wrong_figures(figure.format("3.31 / 4.4")) == [f"3.31 / 4.4 of crossed: the row has {right}"]
+    assert shown_rows.wrong_figures(figure.format("3.31 / 4.4")) == [
+        f"3.31 / 4.4 of crossed: the row has {right}"
+    ]
     page = "<!-- rows: crossed; frames object_mae_mm -->\nold\n<!-- end of rows -->"
     assert "| Crossed, 1 frame | 1 | 2.42 |" in shown_rows.with_tables(page)
     monkeypatch.setattr(shown_rows, "rows_hash", lambda: "of other rows")

@@ -1,4 +1,5 @@
-"""classical-net: what the network can't do whatever its weights, samples with truth, a small training, its method."""
+"""classical-net: what the network can't do whatever its weights, samples with truth, a small
+training, its method."""
 
 from dataclasses import replace
 from functools import cache
@@ -82,17 +83,29 @@ def wild(seed: int = 0) -> DepthFilter:
 @pytest.mark.parametrize("seed", range(3))
 def test_no_depth_that_no_neighbour_has(samples: list[Sample], seed: int) -> None:
     scene = samples[0].scene
-    holes = replace(scene, found=scene.found & (np.random.default_rng(seed).random(scene.found.shape) > 0.2))
-    scene = replace(holes, depth_mm=holes.depth_mm * holes.found, sigma_mm=holes.sigma_mm * holes.found)
+    holes = replace(
+        scene, found=scene.found & (np.random.default_rng(seed).random(scene.found.shape) > 0.2)
+    )
+    scene = replace(
+        holes, depth_mm=holes.depth_mm * holes.found, sigma_mm=holes.sigma_mm * holes.found
+    )
     answer = filtered(wild(seed), scene)
     reach = 2 * REACH + 1
-    least = minimum_filter(np.where(scene.found, scene.depth_mm, np.inf), reach, mode="constant", cval=np.inf)
-    most = maximum_filter(np.where(scene.found, scene.depth_mm, -np.inf), reach, mode="constant", cval=-np.inf)
+    least = minimum_filter(
+        np.where(scene.found, scene.depth_mm, np.inf), reach, mode="constant", cval=np.inf
+    )
+    most = maximum_filter(
+        np.where(scene.found, scene.depth_mm, -np.inf), reach, mode="constant", cval=-np.inf
+    )
     np.testing.assert_array_equal(answer.near, np.isfinite(least))
     slack = 1e-3  # of float32 sums of some hundred mm
-    assert ((answer.depth_mm >= least - slack) & (answer.depth_mm <= most + slack))[answer.near].all()
+    assert ((answer.depth_mm >= least - slack) & (answer.depth_mm <= most + slack))[
+        answer.near
+    ].all()
     changed = np.abs(answer.depth_mm - scene.depth_mm)[scene.found]
-    assert (changed <= BOUND_SIGMAS * scene.sigma_mm[scene.found] + slack).all() and changed.max() > 0.1
+    assert (
+        changed <= BOUND_SIGMAS * scene.sigma_mm[scene.found] + slack
+    ).all() and changed.max() > 0.1
     assert not (decided(answer, scene, -np.inf) & ~answer.near & ~scene.found).any()
 
 
@@ -119,16 +132,20 @@ def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[S
 def test_a_sample_holds_the_exact_depth(views: Views, samples: list[Sample]) -> None:
     view, sample = views[0], samples[0]
     exact = sample.missing + sample.scene.middle_mm
-    np.testing.assert_allclose(exact[sample.target], view.depth_mm[sample.scene.crop][sample.target], atol=2e-3)
+    np.testing.assert_allclose(
+        exact[sample.target], view.depth_mm[sample.scene.crop][sample.target], atol=2e-3
+    )
     error = (sample.scene.depth_mm - sample.missing)[sample.target & sample.scene.found]
     assert 0.05 < np.median(np.abs(error)) < 2
     random, task = np.random.default_rng(1), FilterRecipe(window=96).task(paper_rig(SIZE))
     for _ in range(8):
         window = task.draw(samples, random)
-        assert window["x"].shape == (len(DEPTH_CHANNELS), 96, 96) and window["depth_mm"].shape == window[
-            "valid"
-        ].shape == (96, 96)
-        assert (window["x"][0] == window["found"]).all() and not (window["target"] & ~window["valid"]).any()
+        assert window["x"].shape == (len(DEPTH_CHANNELS), 96, 96) and window[
+            "depth_mm"
+        ].shape == window["valid"].shape == (96, 96)
+        assert (window["x"][0] == window["found"]).all() and not (
+            window["target"] & ~window["valid"]
+        ).any()
     blank = replace(view, frames=np.zeros_like(view.frames))
     assert depth_sample(blank, method()) is None
 
@@ -146,7 +163,9 @@ def test_the_threshold_lets_no_view_lose(samples: list[Sample]) -> None:
     assert chosen_threshold([blind, *right[1:]], samples) == THRESHOLDS[-1]
 
 
-def test_training_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_resumes_to_the_same_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
     recipe = FilterRecipe(steps=4, batch=2, window=64, widths=(4, 6), validate_every=2, lights=0)
     rig = paper_rig(SIZE)
@@ -169,7 +188,9 @@ def test_the_shipped_weights_take_noise_away_on_every_view(views: Views) -> None
     for view in views:
         answer, before = filter_method.answer(frames_of(view)), method().answer(frames_of(view))
         both = (view.depth_mm > 0) & ~view.void & (before.depth > 0)
-        error, error_before = (np.abs(one.depth - view.depth_mm)[both].mean() for one in (answer, before))
+        error, error_before = (
+            np.abs(one.depth - view.depth_mm)[both].mean() for one in (answer, before)
+        )
         assert error < 0.9 * error_before
         assert (answer.depth[before.depth > 0] > 0).all()  # nothing is taken away
         assert answer.sigma_mm is not None and (answer.sigma_mm[answer.depth > 0] > 0).all()
@@ -184,7 +205,9 @@ def test_scores_count_a_missed_pixel_with_its_whole_depth(samples: list[Sample])
         np.full(sample.missing.shape, -9.0, np.float32),
         np.ones_like(sample.target),
     )
-    found = replace(sample.scene, found=sample.scene.found & (np.arange(sample.target.shape[1]) % 2 == 0))
+    found = replace(
+        sample.scene, found=sample.scene.found & (np.arange(sample.target.shape[1]) % 2 == 0)
+    )
     scores = filter_scores(exact, replace(sample, scene=found), 0.0)
     missed = sample.target & ~found.found
     whole = (sample.missing + found.middle_mm)[missed].sum(dtype=np.float64) / sample.target.sum()

@@ -1,4 +1,5 @@
-"""crossed-net: views in drawn lights, samples with truth, windows in all orientations, a small training, its method."""
+"""crossed-net: views in drawn lights, samples with truth, windows in all orientations, a small
+training, its method."""
 
 from dataclasses import replace
 from functools import cache
@@ -63,14 +64,17 @@ def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[Sample], folder:
 
 def test_a_union_shows_the_nearer_object(samples: list[Sample]) -> None:
     names = [sample.name for sample in samples]
-    assert names[:2] == ["wood_block_A0", "duct_tape_A60"] and all("+" in name for name in names[2:])
+    assert names[:2] == ["wood_block_A0", "duct_tape_A60"] and all(
+        "+" in name for name in names[2:]
+    )
     # All that both objects show, but for what the nearer hides and pixels that mix them.
     assert samples[2].target.sum() > 0.95 * max(sample.target.sum() for sample in samples[:2])
 
 
 @pytest.mark.parametrize("turn", range(8))
 def test_windows_mean_the_same_in_every_orientation(samples: list[Sample], turn: int) -> None:
-    # Turning the picture and measuring is turning what was measured: sides and slopes point to the turned places.
+    # Turning the picture and measuring is turning what was measured: sides and slopes point to the
+    # turned places.
     scene = samples[0].scene.single()
     size = min(scene.light.shape)
     scene = scene.window(slice(0, size), slice(0, size))
@@ -94,13 +98,17 @@ def test_labels_say_which_candidate_and_how_far(samples: list[Sample]) -> None:
         seen, task = [], CrossedRecipe(window=64, vary=vary).task(crossed_rig(SIZE, "crossed-18"))
         for _ in range(12):
             window = task.draw(samples, rng)
-            assert np.isfinite(window["x"]).all() and window["x"].shape == (len(CROSSED_CHANNELS), 64, 64)
+            assert np.isfinite(window["x"]).all() and window["x"].shape == (
+                len(CROSSED_CHANNELS),
+                64,
+                64,
+            )
             labelled = window["order"] != IGNORED
             assert np.array_equal(labelled, window["fitted"])
             assert (np.abs(window["correction_rad"][labelled]) < 2.3).all()
-            assert np.take_along_axis(window["exists"], np.where(labelled, window["order"], 1)[None], 0)[0][
-                labelled
-            ].all()
+            assert np.take_along_axis(
+                window["exists"], np.where(labelled, window["order"], 1)[None], 0
+            )[0][labelled].all()
             assert not (window["target"] & ~window["mask_valid"]).any()
             seen += [window["order"][labelled]]
         base = (np.concatenate(seen) == 1).mean()
@@ -112,7 +120,14 @@ def test_a_training_in_small_is_resumed_and_predicts(
 ) -> None:
     monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
     recipe = CrossedRecipe(
-        steps=2, validate_every=1, batch=1, window=64, widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4
+        steps=2,
+        validate_every=1,
+        batch=1,
+        window=64,
+        widths=(4, 4),
+        order_widths=(4, 4),
+        fine=4,
+        squeezed=4,
     )
     out, rig = tmp_path / "run", crossed_rig(SIZE, "crossed-18")
     first = train_net(recipe, out, rig=rig, minutes=1e-9)
@@ -135,7 +150,9 @@ def test_a_training_in_small_is_resumed_and_predicts(
 
 def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Path) -> None:
     recipe = CrossedRecipe(widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4)
-    learned = CrossedNetPart(route().model.carriers, recipe.network().eval(), threshold=0.0, lead=0.0)
+    learned = CrossedNetPart(
+        route().model.carriers, recipe.network().eval(), threshold=0.0, lead=0.0
+    )
     view = next(read_views(folder, GROUPS, "train"))
     fitted = route().choose(route().observe(view.frames[0], None))
     scene = CrossedScene.of(fitted)
@@ -149,7 +166,9 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
     part = fitted.seen.carriers
     known = scene.known & (measured.depth_mm[part.crop] > 0)
     psi = part.nearness(np.where(known, measured.depth_mm[part.crop], 1000.0)) * part.joint_gain
-    offers = scene.nearness * part.joint_gain + np.stack([scene.step_rad[0], np.zeros(shape), scene.step_rad[1]])
+    offers = scene.nearness * part.joint_gain + np.stack(
+        [scene.step_rad[0], np.zeros(shape), scene.step_rad[1]]
+    )
     apart = np.abs(psi - correction - offers).min(axis=0)
     assert known.sum() > 500
     assert apart[known].max() < 1e-2
@@ -158,7 +177,9 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
 def test_the_least_that_the_network_states_is_taken_off() -> None:
     sigma = (np.sqrt(2) * np.exp(np.linspace(-6, 1, 50))).astype(np.float32)
     stated = stated_rad(sigma)
-    assert (np.diff(stated) > 0).all() and (stated < sigma).all() and (stated >= 0.359 * sigma).all()
+    assert (
+        (np.diff(stated) > 0).all() and (stated < sigma).all() and (stated >= 0.359 * sigma).all()
+    )
     assert stated[-1] == pytest.approx(0.8 * sigma[-1], rel=1e-3)
 
 
@@ -196,4 +217,6 @@ def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[Sample]) -> None:
     outside = ~scene.inside
     assert decided_mask(answers, replace(scene, strength=5.0), -0.5).all()
     assert not decided_mask(answers, replace(scene, strength=50.0), -0.5)[outside].any()
-    assert np.array_equal(decided_mask(answers, scene, -0.5), scene.inside)  # what was measured stays
+    assert np.array_equal(
+        decided_mask(answers, scene, -0.5), scene.inside
+    )  # what was measured stays

@@ -1,5 +1,5 @@
-"""fringe-net: the truth of its samples, its phases in the image's orientation, an ensemble's uncertainty, a small
-training, and what a perfect network would measure."""
+"""fringe-net: the truth of its samples, its phases in the image's orientation, an ensemble's
+uncertainty, a small training, and what a perfect network would measure."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +32,15 @@ GROUPS = [
     Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
 ]
 SMALL = FringeRecipe(
-    steps=40, batch=2, window=64, warm_up=1, widths=(8, 12), fine=8, validate_every=20, averaged=0.9, unions=0
+    steps=40,
+    batch=2,
+    window=64,
+    warm_up=1,
+    widths=(8, 12),
+    fine=8,
+    validate_every=20,
+    averaged=0.9,
+    unions=0,
 )
 RIGS = {"lines": LINES, "crossed": CROSSED}
 
@@ -58,24 +66,38 @@ def true_phases(rig, fringes: str, depth_mm: np.ndarray) -> np.ndarray:
     return OneCarrier(rig, Settings(direction=fringes)).layer.absolute_phase(depth)[None]
 
 
-def test_the_truth_of_a_sample_is_the_phase_of_the_exact_depth(task: FringeTask, views: list[View]) -> None:
+def test_the_truth_of_a_sample_is_the_phase_of_the_exact_depth(
+    task: FringeTask, views: list[View]
+) -> None:
     samples = task.samples(views)
     lines = task.recipe.fringes == "lines"
-    assert [sample.direction for sample in samples] == list(DIRECTIONS if lines else DIRECTIONS[:1]) * len(views)
+    assert [sample.direction for sample in samples] == list(
+        DIRECTIONS if lines else DIRECTIONS[:1]
+    ) * len(views)
     for sample, view in zip(samples, np.repeat(views, 2 if lines else 1), strict=True):
         fringes = sample.direction if lines else "crossed"
-        truth = true_phases(RIGS[task.recipe.fringes], fringes, view.depth_mm)[:, *sample.scene.crop]
+        truth = true_phases(RIGS[task.recipe.fringes], fringes, view.depth_mm)[
+            :, *sample.scene.crop
+        ]
         count = len(truth)
-        numerator, denominator = sample.missing[:count].astype(np.float64), sample.missing[count:].astype(np.float64)
+        numerator, denominator = (
+            sample.missing[:count].astype(np.float64),
+            sample.missing[count:].astype(np.float64),
+        )
         error = np.abs(wrapped(np.arctan2(numerator, denominator) - truth))[:, sample.target]
-        assert sample.target.sum() > 1000 and np.median(error) < 0.02 and np.quantile(error, 0.95) < 0.2
+        assert (
+            sample.target.sum() > 1000
+            and np.median(error) < 0.02
+            and np.quantile(error, 0.95) < 0.2
+        )
         amplitude = np.hypot(numerator, denominator)[:, sample.target]
         assert 0.4 < np.median(amplitude) < 1.3  # in that of a sinusoid of the surroundings' spread
         assert not sample.missing[:, ~sample.target].any()
 
 
 def test_windows_show_the_phase_that_is_asked_for(task: FringeTask, views: list[View]) -> None:
-    """The light of a window follows the cosine of the phase that is its truth; one carrier grows downwards."""
+    """The light of a window follows the cosine of the phase that is its truth; one carrier grows
+    downwards."""
     samples, random = task.samples(views), np.random.default_rng(0)
     for sample in samples:
         window = task.draw([sample], random)
@@ -107,17 +129,26 @@ class Perfect:
 def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None:
     """Where the order is right, the depth of the true phase is the true depth."""
     rig = CROSSED if fringes == "crossed" else LINES
-    frame = rig.sequence.crossed_frames[0] if fringes == "crossed" else rig.sequence.sinusoids(fringes)[0]
+    frame = (
+        rig.sequence.crossed_frames[0]
+        if fringes == "crossed"
+        else rig.sequence.sinusoids(fringes)[0]
+    )
     render_views(GROUPS[1:], rig, (frame,), tmp_path, 1)
     view = next(read_views(tmp_path, GROUPS, "validation"))
     truth = true_phases(rig, fringes, view.depth_mm)
-    model = TwoCarriers(rig) if fringes == "crossed" else OneCarrier(rig, Settings(direction=fringes))
+    model = (
+        TwoCarriers(rig) if fringes == "crossed" else OneCarrier(rig, Settings(direction=fringes))
+    )
     seen = model.observe(view.frames[0])
     crop = seen.crop
     cut = truth[:, *crop]
     if fringes == "crossed":
         part = CrossedPhases(model.period_px, [Perfect(cut)])
-        route, measured = two_carriers(model, phases=part.before, learned=part.after), two_carriers(model)
+        route, measured = (
+            two_carriers(model, phases=part.before, learned=part.after),
+            two_carriers(model),
+        )
     else:
         rotation = Geometry(model).rotation
         part = FringePhase(Geometry(model), [Perfect(rotation.turn(cut) * rotation.sign)])
@@ -146,7 +177,9 @@ def test_an_ensemble_states_how_far_its_members_are_apart() -> None:
     assert three.sigma_rad == pytest.approx(np.hypot(0.02 * np.sqrt(2), 0.3), rel=1e-3)
 
 
-def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_in_small_is_resumed_and_predicts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
     out = tmp_path / "run"
     first = train_net(SMALL, out, rig=LINES, minutes=1e-9)
@@ -154,7 +187,8 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
     trained = train_net(SMALL, out, rig=LINES)
     assert trained.weights == out / "fringe-net-lines-42.safetensors"
     log = [
-        float(line.split('"loss_phase": ')[1].split(",")[0]) for line in (out / "log.jsonl").read_text().splitlines()
+        float(line.split('"loss_phase": ')[1].split(",")[0])
+        for line in (out / "log.jsonl").read_text().splitlines()
     ]
     assert log[1] < 0.7 * log[0]
     assert 0 < trained.validation["interior_rad"] < 1.5
@@ -165,10 +199,15 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
         method = FringeNetMethod.for_rig(LINES, fringes=direction, weights=trained.weights)
         answer = method.answer(frames)
         assert answer.sigma_mm is not None and np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
-        assert method.settings["fringes"] == direction and f"one {direction} frame by one network" in method.title
+        assert (
+            method.settings["fringes"] == direction
+            and f"one {direction} frame by one network" in method.title
+        )
         submission = SimpleNamespace(settings=method.settings, name=method.title)
         assert FringeNetMethod.short_name(submission) == f"fringe-net, 1 {direction}"  # type: ignore[arg-type]
-    with pytest.raises(PredictionError, match="learned from horizontal, vertical fringes only, not from crossed"):
+    with pytest.raises(
+        PredictionError, match="learned from horizontal, vertical fringes only, not from crossed"
+    ):
         FringeNetMethod.for_rig(CROSSED, weights=trained.weights)
     with pytest.raises(PredictionError, match="projects no crossed frame"):
         FringeNetMethod.for_rig(LINES, fringes="crossed", weights=trained.weights)
@@ -176,14 +215,21 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
         FringeNetMethod.for_rig(LINES, members=4)
 
 
-def test_crossed_fringes_that_were_not_learned_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crossed_fringes_that_were_not_learned_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
     recipe = replace(SMALL, fringes="crossed", steps=1, validate_every=1)
     trained = train_net(recipe, tmp_path / "run", rig=CROSSED)
     assert trained.weights is not None
     method = FringeNetMethod.for_rig(CROSSED, weights=trained.weights)
-    assert method.frames_used == CROSSED.sequence.crossed_frames[:1] and method.settings["fringes"] == "crossed"
-    with pytest.raises(PredictionError, match=r"learned crossed fringes .*18.*this rig projects .*12"):
+    assert (
+        method.frames_used == CROSSED.sequence.crossed_frames[:1]
+        and method.settings["fringes"] == "crossed"
+    )
+    with pytest.raises(
+        PredictionError, match=r"learned crossed fringes .*18.*this rig projects .*12"
+    ):
         FringeNetMethod.for_rig(crossed_rig(480, "crossed-12"), weights=trained.weights)
 
 

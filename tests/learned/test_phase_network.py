@@ -1,4 +1,5 @@
-"""phase-net: what it can't do by construction, and what its weights give on planes, on objects and on other rigs."""
+"""phase-net: what it can't do by construction, and what its weights give on planes, on objects and
+on other rigs."""
 
 from dataclasses import replace
 
@@ -26,7 +27,10 @@ def part_of(rig: Rig, size: int) -> Rig:
     """The middle ``size`` px of the camera's image, at its full resolution."""
     camera = rig.camera
     left, top = (camera.width - size) / 2, (camera.height - size) / 2
-    return replace(rig, camera=replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top))
+    return replace(
+        rig,
+        camera=replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top),
+    )
 
 
 def with_network(
@@ -47,8 +51,8 @@ def wild(bound_rad: float) -> PhaseNet:
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_random_weights_stay_on_the_candidates(direction: str) -> None:
-    """Every depth is a candidate of the working range, moved by at most the bound, whatever the weights; where there is
-    one candidate, its order is that one."""
+    """Every depth is a candidate of the working range, moved by at most the bound, whatever the
+    weights; where there is one candidate, its order is that one."""
     bound = 0.5
     settings = Settings(direction=direction)
     network_route = with_network(RIG, settings, wild(bound))
@@ -58,7 +62,9 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     base = network_route.choose(observation).order
     on_object = measurement.depth_mm[observation.crop] > 0
     assert on_object.sum() > 3000
-    absolute = observation.layer.absolute_phase(np.where(on_object, measurement.depth_mm[observation.crop], 1000.0))
+    absolute = observation.layer.absolute_phase(
+        np.where(on_object, measurement.depth_mm[observation.crop], 1000.0)
+    )
     order = np.rint((absolute - observation.phase_rad) / TAU)
     correction = (absolute - observation.phase_rad - TAU * order)[on_object]
     assert np.abs(correction).max() < bound + 1e-3
@@ -72,7 +78,8 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
-    """Of a rig whose range is shorter than a period, the order is the measured candidate, whatever the network says."""
+    """Of a rig whose range is shorter than a period, the order is the measured candidate, whatever
+    the network says."""
     short = replace(RIG, working_range_mm=(1685.0, 1915.0))
     assert short.periods_in_range(direction) < 1  # type: ignore[arg-type]
     image = photograph("cork", "A60").frames[FIRST[direction]]
@@ -90,7 +97,8 @@ def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
 
 
 def test_any_albedo_says_what_it_cannot_tell() -> None:
-    """Without brightness most orders are ambiguous, and a wrong one is not denied by the uncertainty."""
+    """Without brightness most orders are ambiguous, and a wrong one is not denied by the
+    uncertainty."""
     row = photograph("cracker_box", "A60")
     measurement = PhaseNetMethod(RIG, albedo="any").route.measure(row.frames[0])
     given = (measurement.depth_mm > 0) & (row.depth_mm > 0)
@@ -106,7 +114,8 @@ def test_brighter_or_darker_frames_have_the_same_depth() -> None:
     image = photograph("cork", "A60").frames[0]
     method = PhaseNetMethod(RIG)
     full = method.route.measure(image)
-    # Light above the ambient grey level, halved; what is rounded to whole grey levels is noise of half a level.
+    # Light above the ambient grey level, halved; what is rounded to whole grey levels is noise of
+    # half a level.
     background = method.route.observe(image, None).background
     half_grey = background.ambient_grey + (image - background.ambient_grey) / 2
     half = method.route.measure(np.rint(half_grey).astype(np.uint8))
@@ -123,22 +132,31 @@ def test_an_empty_scene_has_no_depth() -> None:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("distance_m", [1.52, 1.8, 2.08])
 def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None:
-    """Where the UNet collapses to background; at the benchmark's resolution, without background in view, so the user
-    says how bright the lamp is."""
+    """Where the UNet collapses to background; at the benchmark's resolution, without background in
+    view, so the user says how bright the lamp is."""
     rig, file = part_of(paper_rig(960), 240), load_net()
     told = Settings(direction, **USERS_WORD)  # type: ignore[arg-type]
     image = plane_fringe(rig, FIRST[direction], plane_depth_m(rig, distance_m))
-    measurement = with_network(rig, told, file.network, file.config.threshold, file.config.lead).measure(image)
+    measurement = with_network(
+        rig, told, file.network, file.config.threshold, file.config.lead
+    ).measure(image)
     assert (measurement.depth_mm > 0).mean() > 0.98
     assert np.abs(measurement.depth_mm - 1000 * distance_m)[measurement.depth_mm > 0].mean() < 2.0
 
 
-@pytest.mark.parametrize("translation_m", [RIG.translation_m, (0.0, 0.0, -0.1)], ids=["beside", "on the axis"])
-def test_beyond_the_end_of_the_range_there_is_no_depth(translation_m: tuple[float, float, float]) -> None:
-    """Whatever the network's correction, at the range's end and where the projector is on the camera's axis."""
+@pytest.mark.parametrize(
+    "translation_m", [RIG.translation_m, (0.0, 0.0, -0.1)], ids=["beside", "on the axis"]
+)
+def test_beyond_the_end_of_the_range_there_is_no_depth(
+    translation_m: tuple[float, float, float],
+) -> None:
+    """Whatever the network's correction, at the range's end and where the projector is on the
+    camera's axis."""
     rig = replace(part_of(paper_rig(960), 240), translation_m=translation_m)
     network_route = with_network(rig, Settings(**USERS_WORD), wild(0.5))  # type: ignore[arg-type]
-    measurement = network_route.measure(plane_fringe(rig, 0, plane_depth_m(rig, 2.095, (0.06, 0.0)), (0.06, 0.0)))
+    measurement = network_route.measure(
+        plane_fringe(rig, 0, plane_depth_m(rig, 2.095, (0.06, 0.0)), (0.06, 0.0))
+    )
     depth_mm, outside = measurement.depth_mm, measurement.reason == Reason.OUT_OF_RANGE
     assert outside.mean() > 0.05 and not depth_mm[outside].any()
     assert rig.in_range(depth_mm[depth_mm > 0]).all()
@@ -168,7 +186,8 @@ def test_an_image_without_an_object_has_no_depth_outside_the_range(name: str, im
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_a_plane_in_unknown_light_is_ambiguous(direction: str) -> None:
-    """The same without background in view and without the user's word: no order can be told from brightness."""
+    """The same without background in view and without the user's word: no order can be told from
+    brightness."""
     rig = part_of(paper_rig(960), 240)
     measurement = PhaseNetMethod(rig, direction=direction).route.measure(  # type: ignore[arg-type]
         plane_fringe(rig, FIRST[direction], plane_depth_m(rig, 1.8))
@@ -185,7 +204,9 @@ def test_short_periods_are_resampled_to_those_of_training(direction: str) -> Non
     for size, resampled in ((480, True), (720, False), (960, False), (1920, True)):
         assert PhaseNetMethod(paper_rig(size)).route.model.resampling.needed is resampled
     row = photograph("cracker_box", "A60", rig)
-    measurement = PhaseNetMethod(rig, direction=direction).route.measure(row.frames[FIRST[direction]])  # type: ignore[arg-type]
+    measurement = PhaseNetMethod(rig, direction=direction).route.measure(
+        row.frames[FIRST[direction]]
+    )  # type: ignore[arg-type]
     target = row.depth_mm > 0
     error = np.abs(measurement.depth_mm - row.depth_mm)[target]
     assert np.median(error) < 2 and (error > 100).mean() < 0.02
@@ -207,7 +228,9 @@ def test_objects_at_unknown_distance_also_on_another_rig(rig: Rig) -> None:
 def test_method_is_registered_and_reports_itself() -> None:
     phase_net = load_method("phase-net", RIG, direction="vertical")
     assert phase_net.frames_used == (18,) and phase_net.uses_ground_truth_range is False
-    assert "learned" in phase_net.title and phase_net.settings["weights_sha256"] == load_net().sha256
+    assert (
+        "learned" in phase_net.title and phase_net.settings["weights_sha256"] == load_net().sha256
+    )
     assert "one albedo" in phase_net.title and phase_net.settings["shading"] is True
     assert load_method("phase-net", RIG, albedo="any").settings["weights"] == "phase-net-any-albedo"
     assert 100_000 < phase_net.parameters < 1_000_000  # type: ignore[attr-defined]

@@ -1,4 +1,5 @@
-"""The stated chance of a wrong order: calibrated, never denied where doubted, and 0 where there is no other order."""
+"""The stated chance of a wrong order: calibrated, never denied where doubted, and 0 where there is
+no other order."""
 
 import numpy as np
 import pytest
@@ -22,7 +23,9 @@ def judged(scale: float, group: str = "paper", seed: int = 0, count: int = 20000
     random = np.random.default_rng([seed, int(10 * scale)])
     log_odds = random.uniform(0, 6, count)
     wrong = random.random(count) < 1 / (1 + np.exp(log_odds))
-    logits = np.stack([np.zeros(count), scale * log_odds, np.full(count, -np.inf)]).astype(np.float32)
+    logits = np.stack([np.zeros(count), scale * log_odds, np.full(count, -np.inf)]).astype(
+        np.float32
+    )
     return Judged(group, logits, np.ones(count, np.intp), wrong)
 
 

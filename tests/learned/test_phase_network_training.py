@@ -1,4 +1,5 @@
-"""Training phase-net: windows that are what another scene would show, stopping and going on, weights on disk."""
+"""Training phase-net: windows that are what another scene would show, stopping and going on,
+weights on disk."""
 
 import json
 from dataclasses import replace
@@ -28,7 +29,14 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(240)
 AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, mirror=0, brightness=0)
-OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0, "uncertain": True}
+OPTIONS = {
+    "widths": [4, 6],
+    "fine": 4,
+    "squeezed": 6,
+    "order_widths": [4, 6],
+    "bound_rad": 1.0,
+    "uncertain": True,
+}
 SMALL = PhaseRecipe(
     steps=4,
     batch=2,
@@ -53,15 +61,19 @@ CONFIG = NetConfig(
 
 
 def geometry(direction: str = "horizontal") -> Geometry:
-    """Of a calibrated lamp: planes that fill the frame show no background to take its strength from."""
+    """Of a calibrated lamp: planes that fill the frame show no background to take its strength
+    from."""
     return Geometry(OneCarrier(RIG, Settings(direction=direction, **USERS_WORD)))  # type: ignore[arg-type]
 
 
 def plane(distance_m: float, direction: str = "horizontal") -> Sample:
-    """A tilted plane that fills the frame; one ray a pixel, since the fringe is to be as deep as it is bright."""
+    """A tilted plane that fills the frame; one ray a pixel, since the fringe is to be as deep as it
+    is bright."""
     tilt = (0.1, -0.1)
     depth_m = plane_depth_m(RIG, distance_m, tilt)
-    image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3, light=DIRECT)
+    image = plane_fringe(
+        RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3, light=DIRECT
+    )
     depth_mm, nothing = (1000 * depth_m).astype(np.float32), np.zeros(depth_m.shape, bool)
     view = View("plane_A0", "plane", "paper", image[None], depth_mm, nothing)
     sample = phase_sample(view, image, geometry(direction))
@@ -85,8 +97,12 @@ class ToTheMiddle(np.random.Generator):
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> None:
-    """Against the benchmark's own light and sensor on a plane at the other distance: fringe, brightness, candidates."""
-    moved, random = replace(AS_CAPTURED, shift=1.0), [ToTheMiddle(np.random.PCG64(1)) for _ in range(2)]
+    """Against the benchmark's own light and sensor on a plane at the other distance: fringe,
+    brightness, candidates."""
+    moved, random = (
+        replace(AS_CAPTURED, shift=1.0),
+        [ToTheMiddle(np.random.PCG64(1)) for _ in range(2)],
+    )
     moved_window = task(240, moved, direction).draw([plane(1.7, direction)], random[0])
     captured_window = task(240, AS_CAPTURED, direction).draw([plane(1.8, direction)], random[1])
     lit = (
@@ -98,10 +114,18 @@ def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> N
         moved_window["x"][PHASE_CHANNELS.index("brightness")] > -0.5
     )  # the projector's field ends before the camera's
     assert lit.mean() > 0.5
-    for name, tolerance in (("brightness", 0.03), ("base: brightness misfit", 0.05), ("slope down", 0.02)):
+    for name, tolerance in (
+        ("brightness", 0.03),
+        ("base: brightness misfit", 0.05),
+        ("slope down", 0.02),
+    ):
         channel = PHASE_CHANNELS.index(name)
-        assert np.abs(np.median(moved_window["x"][channel][lit] - captured_window["x"][channel][lit])) < tolerance, name
-    # Fringe and phase part by what an object keeps and a frame-filling plane does not: its place in the image.
+        assert (
+            np.abs(np.median(moved_window["x"][channel][lit] - captured_window["x"][channel][lit]))
+            < tolerance
+        ), name
+    # Fringe and phase part by what an object keeps and a frame-filling plane does not: its place in
+    # the image.
     assert np.abs(moved_window["x"][PHASE_CHANNELS.index("fit misfit")][lit]).mean() < 0.03
     assert (moved_window["order"][lit] == 1).mean() > 0.99
     assert np.abs(moved_window["correction_rad"][lit]).mean() < 0.05
@@ -113,7 +137,9 @@ def test_wrong_first_orders_are_labelled_as_such() -> None:
     orders = []
     for seed in range(4):
         window = task(96, vary).draw(samples, np.random.default_rng(seed))
-        assert np.take_along_axis(window["exists"], np.maximum(window["order"], 0)[None], 0)[0][window["fitted"]].all()
+        assert np.take_along_axis(window["exists"], np.maximum(window["order"], 0)[None], 0)[0][
+            window["fitted"]
+        ].all()
         orders += [window["order"][window["fitted"]]]
     labels = np.unique(np.concatenate(orders))
     assert {0, 2} & set(labels.tolist())
@@ -133,7 +159,9 @@ def test_turning_for_the_network_and_back() -> None:
 def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
     samples, small = [plane(1.7), plane(1.9)], task(SMALL.window, SMALL.vary)
 
-    def trained(name: str, recipe: PhaseRecipe = SMALL, minutes: float | None = None) -> WindowTraining:
+    def trained(
+        name: str, recipe: PhaseRecipe = SMALL, minutes: float | None = None
+    ) -> WindowTraining:
         (tmp_path / name).mkdir(exist_ok=True)
         with reproducible(cpu=True):
             small.recipe = recipe
@@ -187,7 +215,8 @@ def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
     x = torch.rand(1, len(PHASE_CHANNELS), 24, 24)
     with torch.inference_mode():
         for answer, loaded in zip(network.eval()(x), file.network(x), strict=True):
-            # Every weight is rounded to half precision, by 2**-12 of it at most; float32 rounding is far below that.
+            # Every weight is rounded to half precision, by 2**-12 of it at most; float32 rounding
+            # is far below that.
             tolerance = 2**-9 * float(answer.abs().max())
             torch.testing.assert_close(loaded, answer, rtol=0, atol=tolerance)
             assert answer.std() > 10 * tolerance
@@ -197,14 +226,20 @@ def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "small.safetensors"
     save_net(path, PhaseNet(**OPTIONS), CONFIG)
     data = path.read_bytes()
-    cut, junk, wider = tmp_path / "cut.safetensors", tmp_path / "junk.safetensors", tmp_path / "wider.safetensors"
+    cut, junk, wider = (
+        tmp_path / "cut.safetensors",
+        tmp_path / "junk.safetensors",
+        tmp_path / "wider.safetensors",
+    )
     cut.write_bytes(data[:-100])
     junk.write_bytes(b"not weights at all")
     wide = PhaseNet(**OPTIONS | {"widths": [4, 8]})
     save_net(wider, wide, replace(CONFIG, options=wide.options))
     wider.write_bytes(wider.read_bytes().replace(rb"\"widths\":[4,8]", rb"\"widths\":[4,6]"))
     with pytest.raises(WeightsError, match=r"tensor .*: expected float32"):
-        save_net(tmp_path / "not.safetensors", PhaseNet(**OPTIONS), replace(CONFIG, options=wide.options))
+        save_net(
+            tmp_path / "not.safetensors", PhaseNet(**OPTIONS), replace(CONFIG, options=wide.options)
+        )
     unet = next(SHIPPED.glob("*.safetensors"))
     for file, message in (
         (tmp_path / "none.safetensors", "found nothing"),
@@ -226,8 +261,11 @@ def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
     assert header["__metadata__"]["format"] == "fpp-ml-bench phase-net"
 
 
-def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From its own views to weights that a method takes; views whose light nothing calibrates are left out."""
+def test_a_training_in_small_is_resumed_and_predicts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From its own views to weights that a method takes; views whose light nothing calibrates are
+    left out."""
     rig = paper_rig(320)
     groups = [
         Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
@@ -247,7 +285,9 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
     assert "any albedo" in method.title and method.settings["shading"] is False
     view = next(read_views(out / "views", groups, "validation"))
     answer = method.answer([view.frames[0]] + [None] * (len(rig.sequence) - 1))
-    assert answer.depth.dtype == np.float32 and np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
+    assert answer.depth.dtype == np.float32 and np.array_equal(
+        answer.sigma_mm > 0, answer.depth > 0
+    )
     dark = replace(view, frames=view.frames // 50)
     its_task = replace(recipe, albedo="one").task(rig)
     assert len(its_task.samples([view])) == 1 and its_task.samples([dark]) == []

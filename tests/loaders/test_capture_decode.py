@@ -1,4 +1,5 @@
-"""The commands patterns and decode, on captures that the renderer makes of a rig with vertical codes alone."""
+"""The commands patterns and decode, on captures that the renderer makes of a rig with vertical
+codes alone."""
 
 import json
 from pathlib import Path
@@ -10,7 +11,11 @@ import pytest
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.coding.code import Reason
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_sigma_mm, noise_of_frames
+from fpp_ml_bench.decoding.triangulation import (
+    coordinate_slope_px_per_mm,
+    depth_sigma_mm,
+    noise_of_frames,
+)
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, whole_folder
 from fpp_ml_bench.loaders.captures.decoding import decode_capture
@@ -27,14 +32,18 @@ SIZE = 120
 def vertical_rig(scheme: dict):
     data = paper_rig(SIZE).to_dict()
     del data["pitch_px"]
-    return rig_from_dict({**data, "sequence": {"vertical": scheme, "order": ["vertical", "white", "black"]}})
+    return rig_from_dict(
+        {**data, "sequence": {"vertical": scheme, "order": ["vertical", "white", "black"]}}
+    )
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """A mug seen by a rig with two periods of four steps: folder, rig file, exact depth."""
     folder = tmp_path_factory.mktemp("capture")
-    rig = vertical_rig({"scheme": "phase-shift", "pitches_px": [48, 912], "steps": [4, 8], "sign": -1})
+    rig = vertical_rig(
+        {"scheme": "phase-shift", "pitches_px": [48, 912], "steps": [4, 8], "sign": -1}
+    )
     save_rig(rig, folder / "rig.yaml")
     studio = Studio(BuildSettings(rig, ("mug",)))
     row = studio.photograph(solid_mesh("mug"), "A60")
@@ -62,7 +71,14 @@ def test_decoded_capture_is_the_scene(capture, tmp_path, capsys):
     assert report["noise_measured"] and report["pixels"]["decoded"] == (depth_mm > 0).sum()
     assert len(report["frames"]) == 14
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"depth.mat", "points.ply", "mesh.ply", "picture.png", "sigma_mm.npy", "reason.npy"} <= names
+    assert {
+        "depth.mat",
+        "points.ply",
+        "mesh.ply",
+        "picture.png",
+        "sigma_mm.npy",
+        "reason.npy",
+    } <= names
     assert "uncertainty" in capsys.readouterr().out
 
 
@@ -73,7 +89,10 @@ def test_the_stated_uncertainty_is_that_of_noise():
     profiles = rig.code("vertical").profiles(912).astype(float)
     random, depths = np.random.default_rng(5), []
     for _ in range(30):
-        frames = [np.interp(u_px, np.arange(912), row) * 0.7 + 20 + random.normal(0, 2, len(x)) for row in profiles]
+        frames = [
+            np.interp(u_px, np.arange(912), row) * 0.7 + 20 + random.normal(0, 2, len(x))
+            for row in profiles
+        ]
         frames = [*frames, np.full(len(x), 200.0), np.full(len(x), 20.0)]
         images = np.clip(frames, 0, 255).astype(np.float32).reshape(14, SIZE, SIZE)
         decoded = decode_stack(images, rig, details=True)
@@ -90,7 +109,9 @@ def test_slope_is_the_difference_of_projections():
     rig = paper_rig(64)
     rays = tuple(axis[3:6, 7] for axis in rig.camera.rays())
     for direction, axis in (("vertical", 0), ("horizontal", 1)):
-        ends = [rig.project(np.stack([*rays, np.ones(3)], axis=-1) * z)[axis] for z in (1.7999, 1.8001)]
+        ends = [
+            rig.project(np.stack([*rays, np.ones(3)], axis=-1) * z)[axis] for z in (1.7999, 1.8001)
+        ]
         slope = coordinate_slope_px_per_mm(rig, 1800.0, direction, rays)
         np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 0.2, rtol=1e-6)
 
@@ -105,7 +126,9 @@ def written(folder, frames, tmp_path):
 
 def test_saturated_frames_are_named(capture, tmp_path, capsys):
     folder, row = capture
-    bright = [np.clip(frame.astype(float) * 2.5, 0, 255).astype(np.uint8) for frame in row.frames.values()]
+    bright = [
+        np.clip(frame.astype(float) * 2.5, 0, 255).astype(np.uint8) for frame in row.frames.values()
+    ]
     assert decode(folder, written(folder, bright, tmp_path), tmp_path / "out") == 0
     assert "saturated on lit pixels: frame_" in capsys.readouterr().err
     assert (np.load(tmp_path / "out" / "reason.npy") == Reason.SATURATED).any()
@@ -121,7 +144,9 @@ def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
     assert "not checked" in said.out and "warning" not in said.err
     assert decode(folder, scan, tmp_path / "out") == 2
     assert "frame_2.png and frame_3.png show the same image" in capsys.readouterr().err
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["decode.json"]  # of the refused capture
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [
+        "decode.json"
+    ]  # of the refused capture
     refused = json.loads((tmp_path / "out" / "decode.json").read_text())
     assert refused["examination"]["findings"][0]["severity"] == "refuse" and "pixels" not in refused
     assert decode(folder, scan, tmp_path / "out", "--anyway", "--forms", "npy") == 0
@@ -131,7 +156,9 @@ def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
     assert report["pixels"] and not (tmp_path / "out" / "depth.mat").exists()
 
 
-def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(capture, tmp_path, monkeypatch):
+def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(
+    capture, tmp_path, monkeypatch
+):
     folder, _ = capture
 
     def killed(*_, **__):
@@ -145,7 +172,10 @@ def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(ca
     monkeypatch.undo()
     assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "mat") == 0
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"decode.json", "depth.mat"} <= names and not {"depth.npy", ".0123456789abcdef.tmp"} & names
+    assert {"decode.json", "depth.mat"} <= names and not {
+        "depth.npy",
+        ".0123456789abcdef.tmp",
+    } & names
 
 
 @pytest.mark.parametrize(("steps", "gamma"), [(3, 2.2), (4, 1.5), (6, 1.0)])
@@ -159,9 +189,13 @@ def test_the_stated_uncertainty_holds_the_error_of_gamma(steps, gamma):
     frames = 12 + 180 * light + np.random.default_rng(3).normal(0, 1, light.shape)
     files = tuple(Path(f"scan/{index}.png") for index in range(len(frames)))
     result = decode_capture(CapturedFrames(np.rint(frames).astype(np.uint8), files), rig)
-    found = (result.decoded.depth_mm > 0) & (u_px > 5) & (u_px < 906)  # the interpolation ends with the pattern
+    found = (
+        (result.decoded.depth_mm > 0) & (u_px > 5) & (u_px < 906)
+    )  # the interpolation ends with the pattern
     error_mm = np.abs(result.decoded.depth_mm - 1000 * depth_m)[found]
-    assert found.mean() > 0.9 and (error_mm > 100).mean() < 0.001  # of wrong orders no uncertainty is stated
+    assert (
+        found.mean() > 0.9 and (error_mm > 100).mean() < 0.001
+    )  # of wrong orders no uncertainty is stated
     assert 1 / 3 < 0.6745 * np.median(result.sigma_mm[found]) / np.median(error_mm) < 3
 
 
@@ -228,7 +262,10 @@ def test_of_two_that_decode_into_a_folder_one_is_told(capture, tmp_path, capsys)
     out = tmp_path / "out"
     with exclusive(out / LOCK_FILE, out, "here", CaptureError):
         assert decode(folder, folder / "scan", out) == 2
-    assert f"{out}: another process is decoding into this folder; wait for it" in capsys.readouterr().err
+    assert (
+        f"{out}: another process is decoding into this folder; wait for it"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(
@@ -238,12 +275,15 @@ def test_of_two_that_decode_into_a_folder_one_is_told(capture, tmp_path, capsys)
         ("projector: {width: 20}", "projector.height: missing"),
         ("projector: {width: 20, height: 20}", "pitch_px: missing"),
         (
-            "projector: {width: 20, height: 20}\nsequence: {vertical: {scheme: gray, bits: 1}, order: [vertical]}",
+            "projector: {width: 20, height: 20}\nsequence: {vertical: {scheme: gray, bits: 1}, "
+            "order: [vertical]}",
             "need",
         ),
     ],
 )
 def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text, said):
     (tmp_path / "projector.yaml").write_text(text)
-    assert main(["patterns", str(tmp_path / "projector.yaml"), "--out", str(tmp_path / "images")]) == 2
+    assert (
+        main(["patterns", str(tmp_path / "projector.yaml"), "--out", str(tmp_path / "images")]) == 2
+    )
     assert said in capsys.readouterr().err and not (tmp_path / "images").exists()

@@ -1,4 +1,5 @@
-"""Depth of a capture as files: read back by other programs' readers, and compared with a plane and a sphere."""
+"""Depth of a capture as files: read back by other programs' readers, and compared with a plane and
+a sphere."""
 
 import re
 from pathlib import Path
@@ -11,7 +12,13 @@ import trimesh
 from PIL import Image
 
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.loaders.captures.exports import check_outputs, clear_outputs, export_capture, pixel_normals, triangles
+from fpp_ml_bench.loaders.captures.exports import (
+    check_outputs,
+    clear_outputs,
+    export_capture,
+    pixel_normals,
+    triangles,
+)
 from fpp_ml_bench.optics.pinhole import Pinhole
 
 CAMERA = Pinhole(64, 48, 90.0, 92.0, 30.3, 24.1, (-0.05, 0.01, 0.001, -0.001, 0.0))
@@ -47,7 +54,9 @@ def test_normals_of_a_sphere():
     there = depth > 0
     assert np.isfinite(normals).all() and (normals[~there] == 0).all()
     np.testing.assert_allclose((normals[there] ** 2).sum(-1), 1, rtol=1e-12)
-    inclined = -(expected * np.stack([X, Y, np.ones_like(X)], -1)).sum(-1) / np.sqrt(X**2 + Y**2 + 1)
+    inclined = -(expected * np.stack([X, Y, np.ones_like(X)], -1)).sum(-1) / np.sqrt(
+        X**2 + Y**2 + 1
+    )
     inside = cv2.erode(there.astype(np.uint8), np.ones((3, 3))) > 0
     assert _degrees(normals, expected)[inside & (inclined > 0.6)].max() < 1.0
     assert there.sum() > 1000
@@ -57,7 +66,9 @@ def test_a_pixel_alone_faces_the_camera_and_steps_are_not_joined():
     depth = np.zeros((48, 64))
     depth[5, 7] = 500.0
     ray = np.array([X[5, 7], Y[5, 7], 1.0])
-    np.testing.assert_allclose(pixel_normals(depth, CAMERA)[5, 7], -ray / np.sqrt(ray @ ray), rtol=1e-12)
+    np.testing.assert_allclose(
+        pixel_normals(depth, CAMERA)[5, 7], -ray / np.sqrt(ray @ ray), rtol=1e-12
+    )
     depth[:] = 500.0
     depth[:, 32:] = 600.0
     flat = pixel_normals(depth, CAMERA)
@@ -71,7 +82,9 @@ def test_triangles_of_a_plane_are_its_normal_and_cover_it():
     points = (np.stack([X, Y, np.ones_like(X)], -1) * PLANE_MM[..., None]).reshape(-1, 3)
     a, b, c = (points[faces[:, i]] for i in range(3))
     across = np.cross(b - a, c - a)
-    np.testing.assert_allclose(across / np.sqrt((across**2).sum(-1, keepdims=True)), [PLANE] * len(faces), atol=1e-9)
+    np.testing.assert_allclose(
+        across / np.sqrt((across**2).sum(-1, keepdims=True)), [PLANE] * len(faces), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("missing", [(0, 0), (0, 1), (1, 0), (1, 1)])
@@ -169,7 +182,11 @@ NAN = np.where(np.arange(64) == 3, np.nan, PLANE_MM)
 @pytest.mark.parametrize(
     ("depth", "options", "message"),
     [
-        (PLANE_MM[:-1], {}, r"depth_mm: expected real numbers of shape \(H, W\) = \(48, 64\).*\(47, 64\)"),
+        (
+            PLANE_MM[:-1],
+            {},
+            r"depth_mm: expected real numbers of shape \(H, W\) = \(48, 64\).*\(47, 64\)",
+        ),
         (PLANE_MM * 1j, {}, "depth_mm: expected real numbers.*complex"),
         (NAN, {}, "depth_mm: expected finite numbers from 0, which means none, up, got 48 others"),
         (-PLANE_MM, {}, "depth_mm: expected finite numbers.*got 3072 others"),
@@ -177,7 +194,11 @@ NAN = np.where(np.arange(64) == 3, np.nan, PLANE_MM)
         (PLANE_MM * 0, {}, "depth_mm: no pixel has a depth"),
         (PLANE_MM * 1e4, {}, "do not fit in a 16-bit PNG"),
         (PLANE_MM, {"grey": np.zeros((3, 3))}, "grey: expected real numbers of shape"),
-        (PLANE_MM, {"grey": np.full((48, 64), 256.0)}, "grey: expected finite numbers from 0 to 255, got 3072"),
+        (
+            PLANE_MM,
+            {"grey": np.full((48, 64), 256.0)},
+            "grey: expected finite numbers from 0 to 255, got 3072",
+        ),
         (PLANE_MM, {"forms": ["obj"]}, "forms: expected some of npy, mat, png, ply, mesh, got obj"),
         (PLANE_MM, {"forms": []}, "forms: expected some of .*got none"),
     ],
@@ -198,7 +219,14 @@ def test_pixels_without_a_ray_have_no_point(tmp_path):
 def _filled(folder, *others):
     """A folder with all that a decoding writes and what a killed one leaves, and ``others``."""
     export_capture(folder, PLANE_MM, CAMERA)
-    names = ("decode.json", "sigma_mm.npy", "modulation.npy", "reason.npy", "picture.png", ".0123456789abcdef.tmp")
+    names = (
+        "decode.json",
+        "sigma_mm.npy",
+        "modulation.npy",
+        "reason.npy",
+        "picture.png",
+        ".0123456789abcdef.tmp",
+    )
     for name in (*names, ".fedcba9876543210.tmp", *others):
         (folder / name).write_text("")
     return folder
@@ -206,7 +234,11 @@ def _filled(folder, *others):
 
 def test_what_a_decoding_wrote_is_removed_the_report_first(tmp_path, monkeypatch):
     removed, unlink = [], Path.unlink
-    monkeypatch.setattr(Path, "unlink", lambda path, **options: (removed.append(path.name), unlink(path, **options))[0])
+    monkeypatch.setattr(
+        Path,
+        "unlink",
+        lambda path, **options: (removed.append(path.name), unlink(path, **options))[0],
+    )
     folder = _filled(tmp_path / "out")
     removed.clear()
     clear_outputs(folder)
@@ -216,7 +248,9 @@ def test_what_a_decoding_wrote_is_removed_the_report_first(tmp_path, monkeypatch
     assert not (tmp_path / "absent").exists()
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "depth.npy.bak", ".depth.npy", ".depth.npy.7.tmp", "depth_mm.npy"])
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "depth.npy.bak", ".depth.npy", ".depth.npy.7.tmp", "depth_mm.npy"]
+)
 def test_other_files_are_named_before_anything_is_removed(tmp_path, name):
     folder = _filled(tmp_path / "out", name)
     before = sorted(folder.iterdir())
@@ -231,7 +265,9 @@ def test_a_file_or_a_folder_in_the_place_of_the_results_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "out" / "depth.npy").mkdir(parents=True)
     for refuse in (check_outputs, clear_outputs):
-        with pytest.raises(CaptureError, match="file: expected a folder for the results, found a file"):
+        with pytest.raises(
+            CaptureError, match="file: expected a folder for the results, found a file"
+        ):
             refuse(tmp_path / "file")
         with pytest.raises(CaptureError, match=r"no decoding writes: depth\.npy"):
             refuse(tmp_path / "out")

@@ -43,7 +43,8 @@ def test_a_folder_a_pattern_a_file_and_a_list(tmp_path):
     (tmp_path / ".frame_9.png").write_text("hidden")
     put(tmp_path, GREY[0, :10], name="preview")
     with pytest.raises(
-        CaptureError, match=r"preview\.png: expected 41 x 30 px of 8 bits as in frame_0.png, found 41 x 10"
+        CaptureError,
+        match=r"preview\.png: expected 41 x 30 px of 8 bits as in frame_0.png, found 41 x 10",
     ):
         read_frames(tmp_path)
     assert np.array_equal(read_frames(tmp_path / "frame_*").frames, GREY)
@@ -64,7 +65,12 @@ def test_natural_order(tmp_path):
     [
         (DEEP, None, 65535, "no level is above 65535: taken as 16 bits"),
         (DEEP >> 4, None, 4095, "no level is above 4095: taken as 12 bits"),
-        (DEEP >> 4 << 4, None, 65520, "all levels are multiples of 16: taken as 12 bits, shifted up by 4"),
+        (
+            DEEP >> 4 << 4,
+            None,
+            65520,
+            "all levels are multiples of 16: taken as 12 bits, shifted up by 4",
+        ),
         (DEEP >> 4, 12, 4095, ""),
         (DEEP >> 4 << 4, 12, 65520, ""),
         (DEEP >> 8, 12, 4095, ""),
@@ -92,7 +98,9 @@ def test_images_are_upright_by_their_orientation(tmp_path, orientation):
             file = tmp_path / f"{number}{suffix}"
             marked.save(file, exif=marked.getexif())
             read = read_frames(file, colour="green").frames[0]
-            expected = upright[..., 1] if image is COLOUR else upright * (255 / np.iinfo(image.dtype).max)
+            expected = (
+                upright[..., 1] if image is COLOUR else upright * (255 / np.iinfo(image.dtype).max)
+            )
             np.testing.assert_allclose(read, expected, rtol=1e-7)
 
 
@@ -103,7 +111,9 @@ def test_equal_channels_and_opaque_alpha_are_grey(tmp_path):
     read = read_frames(tmp_path)
     assert read.frames.dtype == np.uint8 and np.array_equal(read.frames, GREY[[0, 1, 2, 0]])
     put(tmp_path, *[np.dstack([deep] * 3) for deep in DEEP], name="deep_{}")
-    np.testing.assert_allclose(read_frames(tmp_path / "deep_*").frames, DEEP * (255 / 65535), rtol=1e-7)
+    np.testing.assert_allclose(
+        read_frames(tmp_path / "deep_*").frames, DEEP * (255 / 65535), rtol=1e-7
+    )
 
 
 def test_colour_is_turned_to_grey_where_it_is_said_how(tmp_path):
@@ -111,9 +121,13 @@ def test_colour_is_turned_to_grey_where_it_is_said_how(tmp_path):
     for channel, colour in enumerate(("blue", "green", "red")):
         read = read_frames(tmp_path, colour=colour).frames
         assert read.dtype == np.uint8 and np.array_equal(read[0], COLOUR[..., channel])
-    np.testing.assert_allclose(read_frames(tmp_path, colour="mean").frames[0], COLOUR.mean(-1), rtol=1e-6)
+    np.testing.assert_allclose(
+        read_frames(tmp_path, colour="mean").frames[0], COLOUR.mean(-1), rtol=1e-6
+    )
     expected = cv2.cvtColor(COLOUR.astype(np.float32), cv2.COLOR_BGR2GRAY)
-    np.testing.assert_allclose(read_frames(tmp_path, colour="luminance").frames[0], expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        read_frames(tmp_path, colour="luminance").frames[0], expected, rtol=1e-4
+    )
 
 
 def test_colour_of_sixteen_bits(tmp_path):
@@ -161,15 +175,27 @@ PALETTE.info["transparency"] = 3
         ("a.jpg", _bytes(GREY[0], ".jpg"), "compressed with loss"),
         ("a.png", _bytes(GREY[0], ".jpg"), "compressed with loss"),
         ("a.webp", b"RIFF", "found a .webp file; convert it without loss"),
-        ("a.png", _bytes(COLOUR), "the colour channels differ; say which to take by colour .luminance, red"),
+        (
+            "a.png",
+            _bytes(COLOUR),
+            "the colour channels differ; say which to take by colour .luminance, red",
+        ),
         ("a.png", _bytes(CLEAR), "transparent pixels"),
         ("a.png", _bytes(CLEAR.astype(np.uint16) * 257), "transparent pixels"),
         ("a.png", _saved(PALETTE, "PNG"), "transparent pixels"),
         ("a.png", _saved(PIL.convert("1"), "PNG"), "8 to 16 bits, found mode 1 of 1 bits"),
         ("a.tif", _saved(PIL.convert("F"), "TIFF"), "found mode F of 32 bits"),
         ("a.tif", _saved(PIL.convert("CMYK"), "TIFF"), "found mode CMYK"),
-        ("a.tif", _saved(PIL, "TIFF", save_all=True, append_images=[PIL]), "expected one image, found 2"),
-        ("a.png", _saved(PIL, "PNG", save_all=True, append_images=[PIL.rotate(9)]), "expected one image, found 2"),
+        (
+            "a.tif",
+            _saved(PIL, "TIFF", save_all=True, append_images=[PIL]),
+            "expected one image, found 2",
+        ),
+        (
+            "a.png",
+            _saved(PIL, "PNG", save_all=True, append_images=[PIL.rotate(9)]),
+            "expected one image, found 2",
+        ),
         ("a.tif", _saved(Image.fromarray(DEEP[0]), "TIFF", tiffinfo={262: 0}), "white as 0"),
     ],
 )
@@ -184,13 +210,25 @@ def test_images_that_are_no_frames_are_refused(tmp_path, name, content, message)
     ("images", "options", "message"),
     [
         ((*GREY,), {"count": 4}, "expected 4 frames, found 3 .frame_0.png to frame_2.png"),
-        ((GREY[0], GREY[1, :, :20]), {}, "frame_1.png: expected 41 x 30 px of 8 bits as in frame_0.png, found 20 x 30"),
-        ((GREY[0], DEEP[0]), {}, "frame_1.png: expected 41 x 30 px of 8 bits.*found 41 x 30 px of 16 bits"),
+        (
+            (GREY[0], GREY[1, :, :20]),
+            {},
+            "frame_1.png: expected 41 x 30 px of 8 bits as in frame_0.png, found 20 x 30",
+        ),
+        (
+            (GREY[0], DEEP[0]),
+            {},
+            "frame_1.png: expected 41 x 30 px of 8 bits.*found 41 x 30 px of 16 bits",
+        ),
         ((*DEEP,), {"bits": 12}, "expected levels of 12 bits, 0 to 4095 or multiples of 16"),
         ((*GREY,), {"bits": 12}, "expected levels of 12 bits, found images of 8 bits"),
         ((*GREY,), {"bits": 17}, "bits: expected a whole number from 8 to 16, got 17"),
         ((*GREY,), {"bits": True}, "bits: expected a whole number"),
-        ((*GREY,), {"colour": "grey"}, "colour: expected luminance, red, green, blue, mean, got 'grey'"),
+        (
+            (*GREY,),
+            {"colour": "grey"},
+            "colour: expected luminance, red, green, blue, mean, got 'grey'",
+        ),
     ],
 )
 def test_captures_that_do_not_fit_are_refused(tmp_path, images, options, message):
@@ -206,7 +244,10 @@ def test_sources_without_frames_are_refused(tmp_path):
         (tmp_path / "absent", "expected a folder, an image or a pattern"),
         (tmp_path / "*.png", "no file matches"),
         ([], "got an empty one"),
-        ([tmp_path / "absent.png"], "absent.png: expected a PNG, BMP or TIFF image, found nothing there"),
+        (
+            [tmp_path / "absent.png"],
+            "absent.png: expected a PNG, BMP or TIFF image, found nothing there",
+        ),
         ([tmp_path], "found a folder"),
     ):
         with pytest.raises(CaptureError, match=message):
@@ -219,13 +260,20 @@ def test_names_without_an_order_are_refused(tmp_path):
         folder.mkdir()
         for name in names:
             assert cv2.imwrite(str(folder / name), GREY[0])
-        with pytest.raises(CaptureError, match="the same name or number, so the frames have no order"):
+        with pytest.raises(
+            CaptureError, match="the same name or number, so the frames have no order"
+        ):
             read_frames(folder)
 
 
 def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path):
     """Random damage to images without checksums, which it may leave readable."""
-    for content, suffix in ((BMP, ".bmp"), (TIF, ".tif"), (_saved(PIL, "TIFF"), ".tif"), (PNG, ".png")):
+    for content, suffix in (
+        (BMP, ".bmp"),
+        (TIF, ".tif"),
+        (_saved(PIL, "TIFF"), ".tif"),
+        (PNG, ".png"),
+    ):
         for _ in range(60):
             damaged = bytearray(content)
             for place in RNG.integers(0, min(len(content), 300), 3):
@@ -240,16 +288,27 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path):
 
 
 def test_a_pattern_goes_across_folders(tmp_path):
-    for name in ("scan/2_gray/f_2.png", "scan/10_white/f_1.png", "scan/1_sine/f_10.png", "scan/1_sine/f_9.png"):
+    for name in (
+        "scan/2_gray/f_2.png",
+        "scan/10_white/f_1.png",
+        "scan/1_sine/f_10.png",
+        "scan/1_sine/f_9.png",
+    ):
         put_at(tmp_path / name)
     put_at(tmp_path / "scan/.thumbs/f_1.png")
     expected = ["1_sine/f_9.png", "1_sine/f_10.png", "2_gray/f_2.png", "10_white/f_1.png"]
     for pattern in ("scan/*/*.png", "scan/**/*.png", "sc*/*/f_*"):
-        found = [str(file.relative_to(tmp_path / "scan")) for file in frame_files(tmp_path / pattern)]
+        found = [
+            str(file.relative_to(tmp_path / "scan")) for file in frame_files(tmp_path / pattern)
+        ]
         assert found == expected, pattern
-    with pytest.raises(CaptureError, match=r"no file matches .* has to match files, as 'scan/\*/\*.png'"):
+    with pytest.raises(
+        CaptureError, match=r"no file matches .* has to match files, as 'scan/\*/\*.png'"
+    ):
         frame_files(tmp_path / "scan/*")
-    with pytest.raises(CaptureError, match=r"found none; .* such as .*1_sine, or a pattern .* '.*scan/\*/\*.png'"):
+    with pytest.raises(
+        CaptureError, match=r"found none; .* such as .*1_sine, or a pattern .* '.*scan/\*/\*.png'"
+    ):
         frame_files(tmp_path / "scan")
     put_at(tmp_path / "part [1]/f_1.png")
     assert len(frame_files(tmp_path / "part [1]/f_*.png")) == 1  # the brackets are a name

@@ -1,5 +1,5 @@
-"""A dataset from captures: a plane whose depth is known in closed form, photographed through OpenCV's remap, in folders
-as a scanner leaves them; then every command on it."""
+"""A dataset from captures: a plane whose depth is known in closed form, photographed through
+OpenCV's remap, in folders as a scanner leaves them; then every command on it."""
 
 import json
 import re
@@ -35,15 +35,23 @@ UNIT_CUE = {"scheme": "phase-shift", "pitches_px": [57, 912], "steps": 3, "sign"
 def coded_rig(width=90, height=70, **sequence):
     data = paper_rig(90).to_dict()
     del data["pitch_px"], data["background_m"], data["standoff_m"]
-    data["camera"] |= {"width": width, "height": height, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
-    return rig_from_dict({**data, "sequence": sequence or {"order": ["white", "vertical"], "vertical": UNIT_CUE}})
+    data["camera"] |= {
+        "width": width,
+        "height": height,
+        "cx": (width - 1) / 2,
+        "cy": (height - 1) / 2,
+    }
+    return rig_from_dict(
+        {**data, "sequence": sequence or {"order": ["white", "vertical"], "vertical": UNIT_CUE}}
+    )
 
 
 RIG = coded_rig()
 
 
 def depth_m(rig, number):
-    """A tilted plane, another for every number, that ends a third before the left edge: nothing is seen there."""
+    """A tilted plane, another for every number, that ends a third before the left edge: nothing is
+    seen there."""
     x, y = rig.camera.rays()
     return (1.75 + 0.03 * number) / (1.0 - 0.4 * x + 0.25 * y)
 
@@ -58,7 +66,9 @@ def frames_of(rig, number):
 def write(folder, frames, bits=8):
     folder.mkdir(parents=True)
     for index, frame in enumerate(frames):
-        assert cv2.imwrite(str(folder / f"frame_{index}.png"), frame.astype(np.uint8 if bits == 8 else np.uint16))
+        assert cv2.imwrite(
+            str(folder / f"frame_{index}.png"), frame.astype(np.uint8 if bits == 8 else np.uint16)
+        )
 
 
 def scans(root, rig=RIG):
@@ -82,35 +92,63 @@ def run(*words, command=main):
 
 
 def importing(folder, *more):
-    return run("import", folder / "scans", "--captures", "--out", folder / "set", "--rig", folder / "rig.yaml", *more)
+    return run(
+        "import",
+        folder / "scans",
+        "--captures",
+        "--out",
+        folder / "set",
+        "--rig",
+        folder / "rig.yaml",
+        *more,
+    )
 
 
 def test_captures_become_a_dataset_like_any_other(scanned, capsys):
     (scanned / "splits.yaml").write_text("train: [gear_wheel]\ntest: [bolt]\n")
     assert importing(scanned, "--splits", scanned / "splits.yaml", "--workers", 1) == 0
     said = capsys.readouterr().out
-    assert "train 2, test 1 samples, 21 images" in said and "bolt_single" in said and "low modulation" in said
+    assert (
+        "train 2, test 1 samples, 21 images" in said
+        and "bolt_single" in said
+        and "low modulation" in said
+    )
 
     folder = scanned / "set"
     opened = DatasetFolder(folder)
-    assert opened.splits == {"train": ["gear_wheel_back-2", "gear_wheel_front"], "test": ["bolt_single"]}
-    assert opened.size == (70, 90) and opened.configs == ("single_shot", "vertical", "sinusoidal", "all")
+    assert opened.splits == {
+        "train": ["gear_wheel_back-2", "gear_wheel_front"],
+        "test": ["bolt_single"],
+    }
+    assert opened.size == (70, 90) and opened.configs == (
+        "single_shot",
+        "vertical",
+        "sinusoidal",
+        "all",
+    )
     assert opened.rig == RIG and not opened.has_exact and opened.manifest.origin == "captured"
     for sample, number in (("gear_wheel_front", 0), ("gear_wheel_back-2", 1), ("bolt_single", 2)):
         depth_mm, true_mm = opened.depth_mm(sample), 1000 * depth_m(RIG, number)
         seen = depth_mm > 0
         assert seen[:, 31:].mean() > 0.9 and not seen[:, :29].any()
-        assert np.median(np.abs(depth_mm - true_mm)[seen]) < 2.0  # noise of 1 grey level, three steps of 57 px
+        assert (
+            np.median(np.abs(depth_mm - true_mm)[seen]) < 2.0
+        )  # noise of 1 grey level, three steps of 57 px
         for index, frame in enumerate(frames_of(RIG, number)):
             np.testing.assert_array_equal(opened.frame(sample, index), frame)
         measured = opened.measured(sample)
         assert measured["decoded_share"] == pytest.approx(seen.mean())
         assert measured["median_modulation"] == pytest.approx(0.45 * 127.5, rel=0.1)
         refused = sum(measured["refused_share"].values())
-        assert refused == pytest.approx(1 - seen.mean()) and measured["refused_share"]["low_modulation"] > 0.3
+        assert (
+            refused == pytest.approx(1 - seen.mean())
+            and measured["refused_share"]["low_modulation"] > 0.3
+        )
 
     row = load_dataset(folder, "all", split="test").with_format("numpy")[0]
-    assert [name for name in row if name.startswith("frame_")] == [f"frame_{i:02d}" for i in range(7)]
+    assert [name for name in row if name.startswith("frame_")] == [
+        f"frame_{i:02d}" for i in range(7)
+    ]
     np.testing.assert_array_equal(row["depth"], opened.depth_mm("bolt_single"))
     assert list(load_dataset(folder, split="train")["view"]) == ["back-2", "front"]
 
@@ -129,8 +167,12 @@ def test_captures_become_a_dataset_like_any_other(scanned, capsys):
     assert submission["frames_used"] == [1, 2, 3, 4, 5, 6]
     result = scanned / "result.json"
     assert run(scanned / "predictions", folder, "--json", result, command=evaluate) == 0
-    assert json.loads(result.read_text())["metrics"]["object_mae_mm"] == 0.0  # the process that made the ground truth
-    assert importing(scanned, "--splits", scanned / "splits.yaml") == 0  # finished: nothing is done again
+    assert (
+        json.loads(result.read_text())["metrics"]["object_mae_mm"] == 0.0
+    )  # the process that made the ground truth
+    assert (
+        importing(scanned, "--splits", scanned / "splits.yaml") == 0
+    )  # finished: nothing is done again
 
 
 def test_deeper_images_are_decoded_as_captured_and_stored_in_eight_bits(scanned, capsys):
@@ -150,7 +192,10 @@ def test_deeper_images_are_decoded_as_captured_and_stored_in_eight_bits(scanned,
 @pytest.mark.parametrize(
     ("sequence", "used"),
     [
-        ({"order": ["black", "white", "vertical"], "vertical": {"scheme": "gray", "cell_px": 2}}, 11),
+        (
+            {"order": ["black", "white", "vertical"], "vertical": {"scheme": "gray", "cell_px": 2}},
+            11,
+        ),
         ({"horizontal": UNIT_CUE | {"pitches_px": [57, 1140]}, "vertical": UNIT_CUE}, 12),
     ],
 )
@@ -163,9 +208,13 @@ def test_any_sequence_and_limits(tmp_path, sequence, used):
     depth_mm = opened.depth_mm("part_single")
     seen = depth_mm > 0
     assert seen.mean() > 0.5 and opened.manifest.settings["min_modulation"] == 8
-    assert np.median(np.abs(depth_mm - 1000 * depth_m(rig, 0))[seen]) < 10  # cells of two pixels are the coarsest
+    assert (
+        np.median(np.abs(depth_mm - 1000 * depth_m(rig, 0))[seen]) < 10
+    )  # cells of two pixels are the coarsest
     assert run("predict", "classical", tmp_path / "set", "--out", tmp_path / "p") == 0
-    assert len(yaml.safe_load((tmp_path / "p" / "submission.yaml").read_text())["frames_used"]) == used
+    assert (
+        len(yaml.safe_load((tmp_path / "p" / "submission.yaml").read_text())["frames_used"]) == used
+    )
 
 
 def test_an_interrupted_import_goes_on_and_gives_the_same_bytes(scanned, monkeypatch):
@@ -215,10 +264,16 @@ def test_frames_in_another_order_are_refused_and_imported_anyway(scanned, capsys
     for file, content in zip(files, reversed(contents), strict=True):
         file.write_bytes(content)
     assert importing(scanned) == 2
-    assert "bolt: another reading fits" in (said := capsys.readouterr().err) and "in the opposite order" in said
+    assert (
+        "bolt: another reading fits" in (said := capsys.readouterr().err)
+        and "in the opposite order" in said
+    )
     assert importing(scanned, "--anyway") == 0
     assert "bolt_single: another reading fits" in capsys.readouterr().out
-    assert "another reading fits" in DatasetFolder(scanned / "set").measured("bolt_single")["findings"][0]
+    assert (
+        "another reading fits"
+        in DatasetFolder(scanned / "set").measured("bolt_single")["findings"][0]
+    )
 
 
 def of_many(folder):
@@ -270,7 +325,9 @@ def in_scans(name):
 
 
 def copy_frame(to):
-    return lambda folder: shutil.copy(folder / "scans" / "bolt" / "frame_0.png", folder / "scans" / to)
+    return lambda folder: shutil.copy(
+        folder / "scans" / "bolt" / "frame_0.png", folder / "scans" / to
+    )
 
 
 def rename(old, new):
@@ -278,26 +335,56 @@ def rename(old, new):
 
 
 BAD = {
-    "missing frame": (changed(lambda f: (f / "scans/bolt/frame_6.png").unlink()), "expected the 7 frames.*found 6"),
+    "missing frame": (
+        changed(lambda f: (f / "scans/bolt/frame_6.png").unlink()),
+        "expected the 7 frames.*found 6",
+    ),
     "unreadable image": (of_many, r"(?s)bolt/frame_3\.png.*\n.*front/frame_2\.png"),
-    "another size": (of_frames(lambda image: image[:60]), "bolt: frames of 90 x 60 px, .*camera of 90 x 70 px"),
+    "another size": (
+        of_frames(lambda image: image[:60]),
+        "bolt: frames of 90 x 60 px, .*camera of 90 x 70 px",
+    ),
     "empty object": (changed(in_scans("empty")), "empty: expected a folder with images"),
-    "nothing": (changed(lambda f: [shutil.rmtree(f / "scans"), (f / "scans").mkdir()]), "holds no folder of an object"),
-    "no folder": (changed(lambda f: shutil.rmtree(f / "scans")), "expected a folder with a folder of frames for each"),
+    "nothing": (
+        changed(lambda f: [shutil.rmtree(f / "scans"), (f / "scans").mkdir()]),
+        "holds no folder of an object",
+    ),
+    "no folder": (
+        changed(lambda f: shutil.rmtree(f / "scans")),
+        "expected a folder with a folder of frames for each",
+    ),
     "frames beside objects": (changed(copy_frame(".")), "holds frames itself"),
     "frames beside views": (changed(copy_frame("gear_wheel")), "frames and folders"),
-    "underscore in a view": (changed(rename("gear_wheel/front", "gear_wheel/front_1")), r"no _\), such as front-1"),
+    "underscore in a view": (
+        changed(rename("gear_wheel/front", "gear_wheel/front_1")),
+        r"no _\), such as front-1",
+    ),
     "dot in an object": (changed(rename("bolt", "bolt.v2")), "expected an object name of letters"),
-    "object in two splits": (splits("{train: [bolt], test: [bolt, gear_wheel]}"), "under train and test"),
-    "object twice": (splits("{test: [bolt, bolt, gear_wheel]}"), "'bolt' is listed under test and test"),
+    "object in two splits": (
+        splits("{train: [bolt], test: [bolt, gear_wheel]}"),
+        "under train and test",
+    ),
+    "object twice": (
+        splits("{test: [bolt, bolt, gear_wheel]}"),
+        "'bolt' is listed under test and test",
+    ),
     "object in no split": (splits("{test: [bolt]}"), "'gear_wheel' is in no split"),
     "unknown object": (splits("{test: [bolt, gear_wheel, nut]}"), "'nut' has no captures"),
     "unknown split": (splits("{tests: [bolt, gear_wheel]}"), "tests: is not a key"),
     "splits that are no list": (splits("{test: bolt}"), "test: .*list"),
     "malformed splits": (splits("{test: ["), "is no plain YAML"),
-    "dark": (of_frames(lambda image: image // 40), "refused as low modulation: probably the fringes are too faint"),
-    "overexposed": (of_frames(lambda image: np.minimum(image.astype(int) * 5 + 170, 255)), "refused as .*: probably"),
-    "another range": (of_rig(working_range_mm=[900, 1000], standoff_m=0.95), "nothing in the range: .*another working"),
+    "dark": (
+        of_frames(lambda image: image // 40),
+        "refused as low modulation: probably the fringes are too faint",
+    ),
+    "overexposed": (
+        of_frames(lambda image: np.minimum(image.astype(int) * 5 + 170, 255)),
+        "refused as .*: probably",
+    ),
+    "another range": (
+        of_rig(working_range_mm=[900, 1000], standoff_m=0.95),
+        "nothing in the range: .*another working",
+    ),
     "unknown colour": (lambda f: ("--colour", "cyan"), "colour: expected luminance"),
     "impossible limit": (lambda f: ("--min-modulation", -1), "min_modulation: expected a positive"),
     "frame order": (lambda f: ("--frame-order", "paper"), "belongs to published trees"),
@@ -340,7 +427,9 @@ def test_ground_truth_by_gray_code_needs_black_and_white_stored_or_not():
     gray = {"order": ["black", "white", "vertical"], "vertical": {"scheme": "gray", "cell_px": 4}}
     rig = rig_from_dict({**coded_rig(96, 96, **gray).to_dict(), "background_m": 3.2})
     whole, first = (
-        Studio(BuildSettings(rig, ("mug",), stored=stored)).photograph(solid_mesh("mug"), "A0").depth_mm
+        Studio(BuildSettings(rig, ("mug",), stored=stored))
+        .photograph(solid_mesh("mug"), "A0")
+        .depth_mm
         for stored in ("all", "single_shot")
     )
     assert (whole > 0).sum() > 100

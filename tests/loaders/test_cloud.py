@@ -1,4 +1,5 @@
-"""Point clouds to look at: what the page holds, the PLY file read by another program, and the page in a browser."""
+"""Point clouds to look at: what the page holds, the PLY file read by another program, and the page
+in a browser."""
 
 import base64
 import io
@@ -38,9 +39,12 @@ POINTS_MM = np.stack([X * DEPTH_MM, Y * DEPTH_MM, DEPTH_MM], axis=-1)[THERE]
 
 
 def held(page: bytes) -> dict:
-    """The data of a page, with its positions in steps, int (N, 3), and its grey levels, uint8 (N,)."""
+    """The data of a page, with its positions in steps, int (N, 3), and its grey levels, uint8
+    (N,)."""
     data = json.loads(re.search(r'id="cloud">(.*?)</script>', page.decode(), re.DOTALL)[1])
-    data["places"] = np.frombuffer(base64.b64decode(data["places"]), "<u2").reshape(-1, 3).astype(int)
+    data["places"] = (
+        np.frombuffer(base64.b64decode(data["places"]), "<u2").reshape(-1, 3).astype(int)
+    )
     data["greys"] = np.frombuffer(base64.b64decode(data["greys"]), np.uint8)
     return data
 
@@ -52,7 +56,9 @@ def test_page_holds_the_points():
     assert np.abs(back - POINTS_MM).max() <= data["step_mm"] / 2 * (1 + 1e-9)
     assert data["step_mm"] == pytest.approx(np.ptp(POINTS_MM, axis=0).max() / 65535)
     np.testing.assert_array_equal(data["greys"], GREY[THERE])
-    assert f"{len(POINTS_MM):,} points in mm" in page.decode() and "one of every" not in page.decode()
+    assert (
+        f"{len(POINTS_MM):,} points in mm" in page.decode() and "one of every" not in page.decode()
+    )
     assert b"http" not in page.replace(b"http-equiv", b"")
 
 
@@ -76,7 +82,10 @@ def test_files_are_read_back(tmp_path):
     read = trimesh.load(paths[0], process=False)
     np.testing.assert_allclose(read.vertices, POINTS_MM, atol=1e-3)
     np.testing.assert_array_equal(read.colors[:, 0], GREY[THERE])
-    assert b"\ncomment unit mm (millimetres); camera axes: x right, y down, z forward\n" in paths[0].read_bytes()
+    assert (
+        b"\ncomment unit mm (millimetres); camera axes: x right, y down, z forward\n"
+        in paths[0].read_bytes()
+    )
     data = held(paths[1].read_bytes())
     np.testing.assert_array_equal(data["greys"], GREY[THERE])
     assert "<title>A bowl</title>" in paths[1].read_text()
@@ -128,9 +137,14 @@ def browser():
 
 def _pixels(browser) -> np.ndarray:
     """What the canvas shows, uint8 (H, W, 3), after the next two frames."""
-    browser.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done))).then(() => 1)")
+    browser.run(
+        "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done))).then(() => "
+        "1)"
+    )
     address = browser.run("document.getElementById('view').toDataURL()")
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB")).astype(int)
+    return np.asarray(
+        Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB")
+    ).astype(int)
 
 
 def _drawn(pixels: np.ndarray) -> np.ndarray:
@@ -145,7 +159,8 @@ def test_page_in_a_browser(browser, tmp_path):
     assert browser.run("document.getElementById('without').hidden") is True
     first = _pixels(browser)
     assert 0.02 < _drawn(first).mean() < 0.9
-    # The first view is the camera's: the bowl is round there, and its darker half, with the first rows, is above.
+    # The first view is the camera's: the bowl is round there, and its darker half, with the first
+    # rows, is above.
     rows, columns = np.nonzero(_drawn(first))
     assert np.ptp(rows) == pytest.approx(np.ptp(columns), rel=0.1)
     top, bottom = (first[_drawn(first) & half].mean() for half in _halves(first, rows))
@@ -174,11 +189,19 @@ def _halves(pixels: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def test_the_near_side_follows_the_pointer(browser, tmp_path):
-    """A near point, bright, before a dark plane moves to the right with a drag to the right, and down with one down."""
-    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-100, 100, 60), np.linspace(-100, 100, 60)))
-    plane, knob = np.column_stack([x, y, x * 0 + 1800]), np.column_stack([x / 12, y / 12, x * 0 + 1650])
+    """A near point, bright, before a dark plane moves to the right with a drag to the right, and
+    down with one down."""
+    x, y = (
+        axis.ravel() for axis in np.meshgrid(np.linspace(-100, 100, 60), np.linspace(-100, 100, 60))
+    )
+    plane, knob = (
+        np.column_stack([x, y, x * 0 + 1800]),
+        np.column_stack([x / 12, y / 12, x * 0 + 1650]),
+    )
     grey = np.repeat(np.array([0, 255], np.uint8), len(plane))
-    (page := tmp_path / "knob.html").write_bytes(cloud_html("knob", np.concatenate([plane, knob]), grey))
+    (page := tmp_path / "knob.html").write_bytes(
+        cloud_html("knob", np.concatenate([plane, knob]), grey)
+    )
     browser.open(page, 900, 844)
 
     def place() -> np.ndarray:
@@ -187,9 +210,20 @@ def test_the_near_side_follows_the_pointer(browser, tmp_path):
     start = place()
     box = browser.run("document.getElementById('view').getBoundingClientRect().toJSON()")
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    browser.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, button="left", clickCount=1)
-    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + 40, y=y + 30, button="left", buttons=1)
-    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 40, y=y + 30, button="left", clickCount=1)
+    browser.call(
+        "Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, button="left", clickCount=1
+    )
+    browser.call(
+        "Input.dispatchMouseEvent", type="mouseMoved", x=x + 40, y=y + 30, button="left", buttons=1
+    )
+    browser.call(
+        "Input.dispatchMouseEvent",
+        type="mouseReleased",
+        x=x + 40,
+        y=y + 30,
+        button="left",
+        clickCount=1,
+    )
     row, column = place() - start
     assert column > 5 and row > 5
     before = _drawn(_pixels(browser)).sum()
@@ -226,4 +260,6 @@ def test_axe_finds_nothing(browser, tmp_path):
         browser.open(page, width, 844, dark)
         browser.click("#depth")
         browser.run(f"{axe}; 1")
-        assert browser.run("axe.run().then(r => r.violations.map(v => v.id + v.nodes[0].html))") == []
+        assert (
+            browser.run("axe.run().then(r => r.violations.map(v => v.id + v.nodes[0].html))") == []
+        )

@@ -20,7 +20,9 @@ FRAME = np.where(EXACT_MM > 0, 120, 20).astype(np.uint8)
 def drawn(monkeypatch):
     """The figures that become files."""
     figures, png = [], pictures.figure_png
-    monkeypatch.setattr(pictures, "figure_png", lambda figure: (figures.append(figure), png(figure))[1])
+    monkeypatch.setattr(
+        pictures, "figure_png", lambda figure: (figures.append(figure), png(figure))[1]
+    )
     return figures
 
 
@@ -50,7 +52,9 @@ def test_no_answer_is_an_error_of_the_whole_depth(drawn):
 
 
 def test_missing_pixels_have_a_colour_and_a_legend():
-    drawn = pictures.panel_figure([("error", np.array([[np.inf, 9.0, np.nan]]), "coolwarm", -1.0, 1.0)])
+    drawn = pictures.panel_figure(
+        [("error", np.array([[np.inf, 9.0, np.nan]]), "coolwarm", -1.0, 1.0)]
+    )
     axes = drawn.axes[0]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["missing: no answer"]
     image = axes.images[0]

@@ -1,4 +1,5 @@
-"""What a Hub, or what stands in its place, may answer: anything but what it should ends in a message, soon."""
+"""What a Hub, or what stands in its place, may answer: anything but what it should ends in a
+message, soon."""
 
 import socket
 import threading
@@ -13,7 +14,8 @@ from fpp_ml_bench.loaders.hub import Hub, Unreachable
 
 
 def served(content, drip=False):
-    """A server on this machine that answers every request with these bytes, or begins to and never ends."""
+    """A server on this machine that answers every request with these bytes, or begins to and never
+    ends."""
     server, kept = socket.create_server(("127.0.0.1", 0)), []
 
     def loop():
@@ -40,12 +42,27 @@ def hub_at(server, monkeypatch, **options):
 
 
 def json_answer(text):
-    head = f"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: {len(text)}\r\nConnection: close"
+    head = (
+        f"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: "
+        f"{len(text)}\r\nConnection: close"
+    )
     return f"{head}\r\n\r\n{text}".encode()
 
 
 @pytest.mark.parametrize(
-    "text", ["[]", "null", "5", '"text"', "", "<html>", "{}", '{"sha": 5}', '{"id": "a/b", "siblings": 3}', "[[[["]
+    "text",
+    [
+        "[]",
+        "null",
+        "5",
+        '"text"',
+        "",
+        "<html>",
+        "{}",
+        '{"sha": 5}',
+        '{"id": "a/b", "siblings": 3}',
+        "[[[[",
+    ],
 )
 @pytest.mark.parametrize("question", ["state", "check_token"])
 def test_an_answer_of_another_shape_is_a_message(text, question, monkeypatch):
@@ -54,9 +71,13 @@ def test_an_answer_of_another_shape_is_a_message(text, question, monkeypatch):
         try:
             hub.state("dataset", "some/data") if question == "state" else hub.check_token()
         except FppBenchError as error:
-            assert ("reading dataset some/data" if question == "state" else "asking who the token") in str(error)
+            assert (
+                "reading dataset some/data" if question == "state" else "asking who the token"
+            ) in str(error)
         else:
-            assert text.startswith("{") and question == "check_token"  # a token of nobody, who may publish nothing
+            assert (
+                text.startswith("{") and question == "check_token"
+            )  # a token of nobody, who may publish nothing
 
 
 def test_one_that_never_answers_is_given_up(monkeypatch):
@@ -64,14 +85,20 @@ def test_one_that_never_answers_is_given_up(monkeypatch):
     for content in (b"", b"HTTP/1.1 200 OK\r\nContent-Length: 100\r\n\r\n["):
         with closing(served(content, drip=True)) as server:
             hub = hub_at(server, monkeypatch, sending=False)
-            with pytest.raises(Unreachable, match=r"gave no answer within 0\.2 s; check the network and HF_ENDPOINT"):
+            with pytest.raises(
+                Unreachable,
+                match=r"gave no answer within 0\.2 s; check the network and HF_ENDPOINT",
+            ):
                 hub.state("dataset", "some/data")
 
 
 def test_redirects_without_end_are_a_message(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    head = f"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:{port}/again\r\nContent-Length: 0\r\nConnection: close"
+    head = (
+        f"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:{port}/again\r\nContent-Length: "
+        f"0\r\nConnection: close"
+    )
     real = socket.create_server
     monkeypatch.setattr(socket, "create_server", lambda address: real(("127.0.0.1", port)))
     with closing(served(f"{head}\r\n\r\n".encode())) as server, pytest.raises(RemoteError):

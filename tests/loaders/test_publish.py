@@ -1,4 +1,5 @@
-"""Publishing a dataset to a Hub on the loopback interface, through the real client; read back with ``load_dataset``."""
+"""Publishing a dataset to a Hub on the loopback interface, through the real client; read back with
+``load_dataset``."""
 
 import json
 import re
@@ -47,13 +48,26 @@ def published(client, dataset):
     real = client.good(call)
     real_writes = client.server.writes()
     again = client.good(call)
-    return {"dry": (dry, dry_writes, dry_repos), "real": (real, real_writes), "again": (again, client.server.writes())}
+    return {
+        "dry": (dry, dry_writes, dry_repos),
+        "real": (real, real_writes),
+        "again": (again, client.server.writes()),
+    }
 
 
 def test_a_dry_run_says_everything_and_changes_nothing(published):
     output, writes, repos = published["dry"]
     assert listed(output) == dict.fromkeys(
-        [*DATA, "README.md", "eval.yaml", "fpp-bench.json", "meshes/bowl.ply", "overview.png", "rig.yaml"], "new"
+        [
+            *DATA,
+            "README.md",
+            "eval.yaml",
+            "fpp-bench.json",
+            "meshes/bowl.ply",
+            "overview.png",
+            "rig.yaml",
+        ],
+        "new",
     )
     assert "(new, public)" in output
     assert "Dry run: nothing was sent." in output
@@ -67,7 +81,9 @@ def test_the_real_run_does_what_the_dry_run_said(published, client):
     assert set(repo.files) == {*listed(output), ".gitattributes"}
     assert len(repo.commits) == 2  # the Hub's own, and one that makes everything visible at once
     assert not repo.private
-    assert sum(method == "PUT" for method, _ in writes) == 5  # three Parquet files, a mesh and the picture
+    assert (
+        sum(method == "PUT" for method, _ in writes) == 5
+    )  # three Parquet files, a mesh and the picture
 
 
 def test_a_second_run_sends_nothing(published):
@@ -94,7 +110,9 @@ np.save(f"{out}/streamed.npy", np.asarray(first["frame_00"]))
 
 
 @pytest.mark.processes
-def test_load_dataset_reads_the_same_rows_of_every_configuration(published, client, dataset, tmp_path):
+def test_load_dataset_reads_the_same_rows_of_every_configuration(
+    published, client, dataset, tmp_path
+):
     done = subprocess.run(
         [sys.executable, "-c", READ_BACK, str(tmp_path)],
         env=client.environment(),
@@ -114,7 +132,9 @@ def test_load_dataset_reads_the_same_rows_of_every_configuration(published, clie
                 assert set(features) == {*names, "depth_preview"}
                 assert {name for name, kind in features.items() if kind == "Image"} == images
                 assert list(columns["sample"]) == samples
-                assert list(columns["object"]) == [dataset.measured(sample)["object"] for sample in samples]
+                assert list(columns["object"]) == [
+                    dataset.measured(sample)["object"] for sample in samples
+                ]
                 for row, sample in enumerate(samples):
                     for index in dataset.sequence.config(config):
                         same_bits(columns[f"frame_{index:02d}"][row], dataset.frame(sample, index))
@@ -145,10 +165,16 @@ def test_the_card_describes_columns_and_splits(published, client, dataset):
             split: len(samples) for split, samples in dataset.splits.items()
         }
         features = Features._from_yaml_list(info["features"])
-        assert features["depth"] == Array2D(SIZE, "float32") and isinstance(features[names[4]], Image)
+        assert features["depth"] == Array2D(SIZE, "float32") and isinstance(
+            features[names[4]], Image
+        )
     height, width = SIZE
     pixels = height * width * (1 + 4 + 4 + 1 + 1)  # frame 0, two depths, flags, cover
-    single = next(info for info in yaml.safe_load(head)["dataset_info"] if info["config_name"] == "single_shot")
+    single = next(
+        info
+        for info in yaml.safe_load(head)["dataset_info"]
+        if info["config_name"] == "single_shot"
+    )
     assert single["splits"][-1]["num_bytes"] == 2 * pixels
     for name in ("sample", "depth", "depth_exact", "flags", "cover", "depth_min", "depth_preview"):
         assert f"| `{name}` |" in body
@@ -159,20 +185,33 @@ def test_the_card_describes_columns_and_splits(published, client, dataset):
     assert len(np.unique(picture[height:].reshape(-1, 3), axis=0)) > 2  # the depths
 
 
-@pytest.mark.parametrize(("what", "offline"), [("dataset", True), ("dataset", False), ("leaderboard", False)])
+@pytest.mark.parametrize(
+    ("what", "offline"), [("dataset", True), ("dataset", False), ("leaderboard", False)]
+)
 def test_a_dry_run_works_without_a_network(small, monkeypatch, capsys, tmp_path, what, offline):
     def refuse(*args):
         raise OSError("no network in this test")
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
-    call = ["publish", what, *([str(small.path)] if what == "dataset" else []), "--repo", "alice/never"]
+    call = [
+        "publish",
+        what,
+        *([str(small.path)] if what == "dataset" else []),
+        "--repo",
+        "alice/never",
+    ]
     assert main([*call, "--dry-run"]) == 0
     output = capsys.readouterr().out
-    expected = {*DATA, "README.md", "overview.png"} if what == "dataset" else {"README.md", "index.html"}
+    expected = (
+        {*DATA, "README.md", "overview.png"} if what == "dataset" else {"README.md", "index.html"}
+    )
     assert expected <= listed(output).keys() and set(listed(output).values()) == {"new"}
     reason = "HF_HUB_OFFLINE is set" if offline else "can't be reached"
-    assert re.search(rf"Nothing was asked of the Hub: .*{reason}", output) and "Dry run: nothing was sent." in output
+    assert (
+        re.search(rf"Nothing was asked of the Hub: .*{reason}", output)
+        and "Dry run: nothing was sent." in output
+    )
     monkeypatch.setenv("HF_TOKEN", "hf_good")
     assert main(call) == 2
     assert reason in capsys.readouterr().err
@@ -181,7 +220,9 @@ def test_a_dry_run_works_without_a_network(small, monkeypatch, capsys, tmp_path,
 def test_the_benchmark_is_registered(published, client):
     evaluation = yaml.safe_load(client.server.repos["datasets", "alice/fpp"].files["eval.yaml"])
     assert evaluation["evaluation_framework"] == "fpp-ml-bench"
-    assert {"id": "single_shot_depth", "config": "single_shot", "split": "test"} in evaluation["tasks"]
+    assert {"id": "single_shot_depth", "config": "single_shot", "split": "test"} in evaluation[
+        "tasks"
+    ]
     assert {"id": "multi_frame_depth", "config": "all", "split": "test"} in evaluation["tasks"]
 
 
@@ -203,7 +244,9 @@ def test_other_data_replaces_what_changed_and_leaves_what_others_added(client, t
     assert len(modified) == 3
     (staged / "files" / "data" / ".test.parquet.1.tmp").write_bytes(b"of a run that was killed")
     client.server.writes()
-    assert "Nothing to send" in client.good(["dataset", str(second.path), *call, "--staging", str(staged)])
+    assert "Nothing to send" in client.good(
+        ["dataset", str(second.path), *call, "--staging", str(staged)]
+    )
     assert {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")} == modified
     assert client.server.writes() == []
 
@@ -222,7 +265,8 @@ def test_a_run_that_was_cut_off_sends_only_what_is_missing(client, small):
 
 
 def test_refusals(client, small, tmp_path):
-    """Everything that can go wrong before or on the way says what and what to do, with status 2 and no traceback."""
+    """Everything that can go wrong before or on the way says what and what to do, with status 2 and
+    no traceback."""
     good = ["dataset", str(small.path), "--repo"]
     client.good([*good, "alice/public"])
     client.server.repos["datasets", "alice/other"] = Repo(files={"train.csv": b"a,b\n"})
@@ -233,7 +277,10 @@ def test_refusals(client, small, tmp_path):
         ([*good, "nobody"], "OWNER/NAME"),
         ([*good, "alice/\x1b[31mred"], r"\\x1b"),
         ([*good, "bob/fpp"], "make repositories of alice"),
-        ([*good, "forbidden/fpp"], r"403\); it needs write access.*The Hub says: You don't have the rights"),
+        (
+            [*good, "forbidden/fpp"],
+            r"403\); it needs write access.*The Hub says: You don't have the rights",
+        ),
         ([*good, "broken/fpp"], r"fault \(500\)"),
         ([*good, "alice/other"], r"did not publish \(train.csv.*--adopt"),
         ([*good, "raced/fpp"], r"committed meanwhile \(412\)"),
@@ -241,10 +288,15 @@ def test_refusals(client, small, tmp_path):
         ([*good, "alice/new", "--staging", str(tmp_path / "occupied")], "holds files"),
         ([*good, "alice/new", "--license", "all rights: reserved"], "--license"),
         (["dataset", str(tmp_path), "--repo", "alice/new"], "no dataset"),
-        (["results", "r.json", "--repo", "alice/none", "--dataset-repo", "alice/public"], "no such model"),
+        (
+            ["results", "r.json", "--repo", "alice/none", "--dataset-repo", "alice/public"],
+            "no such model",
+        ),
     ]
     client.server.writes()
-    for (call, message), (status, _, error) in zip(cases, client.run(*(call for call, _ in cases)), strict=True):
+    for (call, message), (status, _, error) in zip(
+        cases, client.run(*(call for call, _ in cases)), strict=True
+    ):
         assert status == 2, call
         assert re.search(message, error, re.DOTALL), (call, error)
         assert "Traceback" not in error and "\x1b" not in error
@@ -266,7 +318,9 @@ def test_refusals(client, small, tmp_path):
 )
 def test_no_way_to_the_hub(client, small, environment, message):
     client.server.writes()
-    ((status, _, error),) = client.run(["dataset", str(small.path), "--repo", "alice/never"], **environment)
+    ((status, _, error),) = client.run(
+        ["dataset", str(small.path), "--repo", "alice/never"], **environment
+    )
     assert status == 2
     assert re.search(message, error, re.DOTALL), error
     assert "Traceback" not in error
@@ -278,7 +332,9 @@ def test_adopting_and_private(client, small):
     repo.files["train.csv"] = b"a,b\n"
     call = ["dataset", str(small.path), "--repo"]
     (adopted, private, unseen) = client.run(
-        [*call, "alice/adopted", "--adopt"], [*call, "alice/secret", "--private"], [*call, "alice/secret", "--dry-run"]
+        [*call, "alice/adopted", "--adopt"],
+        [*call, "alice/secret", "--private"],
+        [*call, "alice/secret", "--dry-run"],
     )
     assert adopted[0] == private[0] == unseen[0] == 0
     assert repo.files["train.csv"] == b"a,b\n" and DATA[0] in repo.files
@@ -304,5 +360,7 @@ def test_help_does_not_wait_for_datasets_or_torch():
         "assert main(['publish', 'dataset', '--help']) == 0\n"
         "print({'datasets', 'torch', 'pandas'} & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     assert done.stdout.splitlines()[-1] == "set()"

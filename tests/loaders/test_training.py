@@ -1,4 +1,5 @@
-"""Training pairs: how many, which, and that every tensor is what the paper's equations give in float64."""
+"""Training pairs: how many, which, and that every tensor is what the paper's equations give in
+float64."""
 
 from types import SimpleNamespace
 
@@ -19,7 +20,8 @@ from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 
 def paper(depth_mm, name, counted=True):
-    """Section 3.3 in float64, from nothing but the depth map; the range is that of the pixels ``counted``."""
+    """Section 3.3 in float64, from nothing but the depth map; the range is that of the pixels
+    ``counted``."""
     d = depth_mm.astype(np.float64)
     if name == "raw":
         return d
@@ -32,10 +34,17 @@ def paper(depth_mm, name, counted=True):
 
 @pytest.mark.parametrize(
     ("config", "pairs"),
-    [("single_shot", 240), ("horizontal", 4320), ("vertical", 4320), ("sinusoidal", 8640), ("all", 12480)],
+    [
+        ("single_shot", 240),
+        ("horizontal", 4320),
+        ("vertical", 4320),
+        ("sinusoidal", 8640),
+        ("all", 12480),
+    ],
 )
 def test_full_set_has_the_papers_training_pairs(tiny, config, pairs):
-    """By arithmetic on the full set's plan; the dataset's own length on rows of that many samples."""
+    """By arithmetic on the full set's plan; the dataset's own length on rows of that many
+    samples."""
     plans = plan_build(BuildSettings(paper_rig(FULL_SIZE), OBJECTS))
     rows = [sample for plan in plans if plan.split == "train" for sample, _, _ in plan.samples]
     assert len(rows) * len(PAPER_SEQUENCE.config(config)) == pairs
@@ -62,7 +71,8 @@ def test_pairs_are_all_frames_of_a_row_then_the_next(tiny, config):
 @pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
 @pytest.mark.parametrize(("background_removed", "rule"), [(False, "object"), (True, "valid")])
 def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed, rule):
-    """By the rule ``valid`` the range is that of the pixels that are not void; depths beyond it are cut to it."""
+    """By the rule ``valid`` the range is that of the pixels that are not void; depths beyond it are
+    cut to it."""
     dataset = FringeDepthDataset(tiny, "test", "vertical", normalisation, background_removed, rule)
     for index in (0, 17, 40, 107):
         item = dataset[index]
@@ -76,7 +86,9 @@ def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed,
         assert item.fringe.shape == item.depth.shape == (1, *opened.size)
         np.testing.assert_allclose(item.fringe[0].numpy(), fringe, rtol=2**-23)
         counted = ~opened.void(sample) if rule == "valid" else np.full(depth.shape, True)
-        np.testing.assert_allclose(item.depth[0].numpy(), paper(depth, normalisation, counted), rtol=2**-22)
+        np.testing.assert_allclose(
+            item.depth[0].numpy(), paper(depth, normalisation, counted), rtol=2**-22
+        )
         inside = depth[(depth > 0) & counted]
         assert item.depth_range_mm.tolist() == [inside.min(), inside.max()]
         assert (inside.size < np.count_nonzero(depth)) == (rule == "valid")

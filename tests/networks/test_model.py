@@ -16,8 +16,8 @@ from fpp_ml_bench.errors import PredictionError, WeightsError
 
 SIZE = (32, 48)
 HALF_PRECISION = 0.02
-"""Change of this network's output, which goes up to 6, for an input rounded to float16: 0.016 was measured. The float32
-rounding of another processor adds less than 0.001."""
+"""Change of this network's output, which goes up to 6, for an input rounded to float16: 0.016 was
+measured. The float32 rounding of another processor adds less than 0.001."""
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +54,22 @@ def test_a_fringe_in_any_form_is_the_same_fringe(folder, fringe):
     model = load(folder / "raw.safetensors")
     depth = model.predict(fringe)
     rounding = rounding_error(model.network, depth)
-    for dtype, tolerance in ((np.float32, rounding), (np.float64, rounding), (np.float16, HALF_PRECISION)):
-        np.testing.assert_allclose(model.predict((fringe / 255).astype(dtype)), depth, rtol=0, atol=tolerance)
+    for dtype, tolerance in (
+        (np.float32, rounding),
+        (np.float64, rounding),
+        (np.float16, HALF_PRECISION),
+    ):
+        np.testing.assert_allclose(
+            model.predict((fringe / 255).astype(dtype)), depth, rtol=0, atol=tolerance
+        )
     wide = np.zeros((SIZE[0], 2 * SIZE[1]), np.uint8)
     wide[:, ::2] = fringe
     wide.flags.writeable = False
     np.testing.assert_array_equal(model.predict(wide[:, ::2]), depth)
     together = model.predict_batch([fringe, fringe[::-1], fringe])
-    np.testing.assert_allclose(together, [depth, model.predict(fringe[::-1]), depth], rtol=0, atol=rounding)
+    np.testing.assert_allclose(
+        together, [depth, model.predict(fringe[::-1]), depth], rtol=0, atol=rounding
+    )
 
 
 def test_what_is_no_fringe_of_this_model(folder, fringe):
@@ -69,7 +77,10 @@ def test_what_is_no_fringe_of_this_model(folder, fringe):
     nan = (fringe / 255).astype(np.float32)
     nan[3, 5] = np.nan
     for wrong, words in (
-        (fringe[:16], r"of 32x48 px \(H x W\), the size unet-raw was trained at, got 16x48.*fringe period"),
+        (
+            fringe[:16],
+            r"of 32x48 px \(H x W\), the size unet-raw was trained at, got 16x48.*fringe period",
+        ),
         (fringe.T, "got 48x32"),
         (fringe[..., None], r"one fringe image \(H, W\), got shape \(32, 48, 1\)"),
         (fringe.astype(np.uint16), "got uint16"),
@@ -90,11 +101,15 @@ def test_an_output_that_is_no_number(tmp_path, fringe):
         network.head.weight.fill_(3e38)
     path = tmp_path / "sick.safetensors"
     save_weights(path, network, config_of(network, normalisation="raw"))  # every weight is finite
-    with pytest.raises(PredictionError, match=r"unet-individual.*gave .* of 1536 values that are NaN or infinite"):
+    with pytest.raises(
+        PredictionError, match=r"unet-individual.*gave .* of 1536 values that are NaN or infinite"
+    ):
         load(path).predict(fringe)
 
 
-@pytest.mark.parametrize("name", ["unet", "transunet", "resunet", "hformer", "pix2pix", "pix2pix_unet"])
+@pytest.mark.parametrize(
+    "name", ["unet", "transunet", "resunet", "hformer", "pix2pix", "pix2pix_unet"]
+)
 def test_every_network_comes_back_as_it_was(tmp_path, name):
     width = {"hformer": 8, "transunet": 4}.get(name, 2)
     if name == "transunet":
@@ -102,14 +117,22 @@ def test_every_network_comes_back_as_it_was(tmp_path, name):
     else:
         network = tiny_network(name, width)
         size = (network.stride * 2, network.stride * 3)
-    save_weights(tmp_path / "net.safetensors", network, config_of(network, image_size=size, normalisation="raw"))
+    save_weights(
+        tmp_path / "net.safetensors",
+        network,
+        config_of(network, image_size=size, normalisation="raw"),
+    )
     model = load(tmp_path / "net.safetensors", "cpu")
     image = np.random.default_rng(1).random(size, dtype=np.float32)
     with torch.no_grad():
-        expected = network.to(memory_format=torch.channels_last)(torch.from_numpy(image)[None, None])[0, 0].numpy()
+        expected = network.to(memory_format=torch.channels_last)(
+            torch.from_numpy(image)[None, None]
+        )[0, 0].numpy()
     np.testing.assert_array_equal(model.predict(image), expected)
     assert model.parameters == sum(p.numel() for p in network.parameters())
-    assert not model.network.training and not any(p.requires_grad for p in model.network.parameters())
+    assert not model.network.training and not any(
+        p.requires_grad for p in model.network.parameters()
+    )
 
 
 def test_what_can_not_be_loaded(folder):

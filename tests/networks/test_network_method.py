@@ -1,4 +1,5 @@
-"""Trained networks on the command line and on the board: tracks, units, masks, and what is refused."""
+"""Trained networks on the command line and on the board: tracks, units, masks, and what is
+refused."""
 
 from html import unescape
 
@@ -85,11 +86,29 @@ def test_what_a_submission_says(dataset, weights, tmp_path, name, units, track, 
     network_method = method(weights, name)
     predict_split(dataset, network_method, "test", tmp_path / "p")
     about = read_submission(tmp_path / "p")
-    assert (about.units, about.track, network_method.mode, about.name) == (units, track, mode, title)
-    assert about.method == f"unet-{name}" and about.frames_used == [0] and about.seeds == {"training": 42}
-    assert {"torch", "numpy", "fpp_ml_bench"} <= set(about.software) and "numba" not in about.software
+    assert (about.units, about.track, network_method.mode, about.name) == (
+        units,
+        track,
+        mode,
+        title,
+    )
+    assert (
+        about.method == f"unet-{name}"
+        and about.frames_used == [0]
+        and about.seeds == {"training": 42}
+    )
+    assert {"torch", "numpy", "fpp_ml_bench"} <= set(
+        about.software
+    ) and "numba" not in about.software
     settings = about.settings
-    trained = {"network": "unet", "width": 2, "loss": "hybrid_l1_0.7", "preset": "small", "seed": 42, "epochs": 2}
+    trained = {
+        "network": "unet",
+        "width": 2,
+        "loss": "hybrid_l1_0.7",
+        "preset": "small",
+        "seed": 42,
+        "epochs": 2,
+    }
     trained["normalisation"] = network_method.model.config.normalisation
     assert trained.items() <= settings.items() and len(settings["weights_sha256"]) == 64
     assert settings.get("depth_range") == ("oracle" if units == "normalised" else None)
@@ -97,7 +116,9 @@ def test_what_a_submission_says(dataset, weights, tmp_path, name, units, track, 
     assert ("uses_ground_truth_mask" in written) == ("removed" in name)
     sample = dataset.samples("test")[0]
     fringe = captured_frames(dataset, network_method, sample)[0]
-    np.testing.assert_array_equal(np.load(tmp_path / "p" / f"{sample}.npy"), network_method.model.predict(fringe))
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "p" / f"{sample}.npy"), network_method.model.predict(fringe)
+    )
 
 
 def test_frames_with_the_background_removed_are_those_of_training(dataset, weights):
@@ -127,7 +148,9 @@ def test_the_frame_is_the_first_it_was_trained_on(tmp_path):
     network = tiny_network(width=2)
     config = config_of(network, normalisation="raw", data_config="vertical", image_size=SIZE)
     save_weights(tmp_path / "v.safetensors", network, config)
-    assert method(tmp_path, "v").frames_used == (18,) and method(tmp_path, "v").title == config.title
+    assert (
+        method(tmp_path, "v").frames_used == (18,) and method(tmp_path, "v").title == config.title
+    )
 
 
 # ---- commands
@@ -137,7 +160,9 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
     out, data = str(tmp_path / "p"), str(dataset.path)
     for name, words in (("full", " --mode paper --json"), ("global", "p-global --json")):
         path = str(weights / f"{name}.safetensors")
-        output = printed(fpp_bench, "predict", path, data, "--out", f"{out}-{name}").splitlines()[-1]
+        output = printed(fpp_bench, "predict", path, data, "--out", f"{out}-{name}").splitlines()[
+            -1
+        ]
         assert words in output and "depth_exact" not in output
         line = output.removeprefix("next: fpp-eval ").split()
         line[-1] = result = str(tmp_path / f"{name}.json")
@@ -146,7 +171,12 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
         timed = ["time", path, data, "--repeats", "2", "--into", result]
         assert "parameters" in printed(fpp_bench, *timed)
         timing = read_result(tmp_path / f"{name}.json").timing
-        assert timing.batched and timing.parameters > 1000 and timing.frames == 1 and timing.device == "cpu"
+        assert (
+            timing.batched
+            and timing.parameters > 1000
+            and timing.frames == 1
+            and timing.device == "cpu"
+        )
         assert "torch" in timing.software
     assert "settings.threads is" in refusal(fpp_bench, *timed, "--threads", "2")
 
@@ -155,8 +185,14 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
     "arguments, words",
     [
         (["no-such.safetensors"], "expected a weights file (*.safetensors), found nothing"),
-        (["{w}/raw.safetensors", "--steps", "4"], "--steps is an option of classical, classical-net, not of"),
-        (["classical", "--device", "cpu"], "--device is an option of trained networks, not of classical"),
+        (
+            ["{w}/raw.safetensors", "--steps", "4"],
+            "--steps is an option of classical, classical-net, not of",
+        ),
+        (
+            ["classical", "--device", "cpu"],
+            "--device is an option of trained networks, not of classical",
+        ),
         (["{w}/raw.safetensors", "--frame", "3"], "frame 3 is not stored here"),
         (["{w}/raw.safetensors", "--device", "abacus"], "device 'abacus' can't be used"),
         (["{w}/raw.safetensors", "--threads", "0"], "--threads 0: expected 1 or more"),
@@ -164,7 +200,9 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
 )
 def test_refusals_on_the_command_line(dataset, weights, tmp_path, arguments, words):
     first, *rest = (part.format(w=weights) for part in arguments)
-    assert words in refusal(fpp_bench, "predict", first, dataset.path, *rest, "--out", tmp_path / "p")
+    assert words in refusal(
+        fpp_bench, "predict", first, dataset.path, *rest, "--out", tmp_path / "p"
+    )
     assert not (tmp_path / "p" / "submission.yaml").exists()
 
 
@@ -196,7 +234,10 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path):
     assert all(len(group.rows) == 1 for group in groups)
     assert fpp_bench("leaderboard", *paths, "--page", tmp_path / "page") == 0
     page = unescape((tmp_path / "page" / "index.html").read_text())
-    assert "oracle mask track" in page and "given the test sample's depth range and object mask" in page
+    assert (
+        "oracle mask track" in page
+        and "given the test sample's depth range and object mask" in page
+    )
     with pytest.raises(PublishError, match="no task for the oracle mask track"):
         task_of(groups[1].rows[0].entry.row, "masked.json")
 
@@ -207,9 +248,15 @@ def test_the_key_changes_no_file_without_it(dataset, tmp_path):
     assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "4.0.0"
     # A result that hides the mask, and one that claims it, both differ from their predictions.
     masked = result.model_copy(
-        update={"submission": Submission(**{**result.submission.model_dump(), "uses_ground_truth_mask": True})}
+        update={
+            "submission": Submission(
+                **{**result.submission.model_dump(), "uses_ground_truth_mask": True}
+            )
+        }
     )
-    assert b'"uses_ground_truth_mask": true' in result_json(masked) and masked.track == "oracle mask"
+    assert (
+        b'"uses_ground_truth_mask": true' in result_json(masked) and masked.track == "oracle mask"
+    )
     assert differences(masked, folder, dataset).lines == [
         "submission.uses_ground_truth_mask: True in the result, None in submission.yaml"
     ]

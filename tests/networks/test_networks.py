@@ -10,19 +10,27 @@ from fpp_ml_bench.errors import NetworkError
 
 SIZE = 64
 
-# The paper's table of architectures and the benchmark's published counts; TransUNet is printed as 116.2 M there.
+# The paper's table of architectures and the benchmark's published counts; TransUNet is printed as
+# 116.2 M there.
 PARAMETERS = {
     "unet": 31_036_481,
     "transunet": 116_162_881,
     "resunet": 88_941_841,
     "hformer": 4_655_993,
     "pix2pix": 182_430_721,
-    # Not published. 4x4 convolutions with biases between 1, 64, 128, 256, 512, 512 and 512 channels,
-    # back from twice as many (from 512 at the bottom), and a 7x7 head of 49 * 64 weights with a bias;
-    # instance normalisation has no weights here.
+    # Not published. 4x4 convolutions with biases between 1, 64, 128, 256, 512, 512 and 512
+    # channels, back from twice as many (from 512 at the bottom), and a 7x7 head of 49 * 64 weights
+    # with a bias; instance normalisation has no weights here.
     "pix2pix_unet": 29_367_809,
 }
-STRIDES = {"unet": 16, "transunet": 16, "resunet": 8, "hformer": 32, "pix2pix": 16, "pix2pix_unet": 8}
+STRIDES = {
+    "unet": 16,
+    "transunet": 16,
+    "resunet": 8,
+    "hformer": 32,
+    "pix2pix": 16,
+    "pix2pix_unet": 8,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +69,8 @@ def test_full_width_runs_at_960_px_on_the_meta_device(name):
 def test_width_scales_every_layer(name):
     with torch.device("meta"):
         narrow, wide = (
-            parameter_count(build(name, **{**SMALL[name], "width": w * int(SMALL[name]["width"])})) for w in (4, 8)
+            parameter_count(build(name, **{**SMALL[name], "width": w * int(SMALL[name]["width"])}))
+            for w in (4, 8)
         )
     assert 3.5 < wide / narrow < 4.1  # products of two widths make up nearly all parameters
 
@@ -69,7 +78,9 @@ def test_width_scales_every_layer(name):
 def _probed(network, x) -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {}
     hooks = [
-        layer.register_forward_hook(lambda _m, _i, out, key=key: shapes.__setitem__(key, tuple(out.shape)))
+        layer.register_forward_hook(
+            lambda _m, _i, out, key=key: shapes.__setitem__(key, tuple(out.shape))
+        )
         for key, layer in network.probe_layers.items()
     ]
     network(x)
@@ -90,7 +101,10 @@ def test_sizes_that_the_strides_do_not_allow(name):
 
 def test_a_refused_size_names_the_nearest():
     network = build("unet", width=2)
-    with pytest.raises(NetworkError, match=r"multiples of 16, at least 32 px; it was given 100x17.*\(96 or 112\)x32"):
+    with pytest.raises(
+        NetworkError,
+        match=r"multiples of 16, at least 32 px; it was given 100x17.*\(96 or 112\)x32",
+    ):
         network(torch.rand(1, 1, 100, 17))
 
 
@@ -101,7 +115,11 @@ def test_transunet_names_the_size_it_was_built_for():
 
 @pytest.mark.parametrize(
     "fringe",
-    [torch.zeros(1, 2, SIZE, SIZE), torch.zeros(1, SIZE, SIZE), torch.zeros(1, 1, SIZE, SIZE, dtype=torch.uint8)],
+    [
+        torch.zeros(1, 2, SIZE, SIZE),
+        torch.zeros(1, SIZE, SIZE),
+        torch.zeros(1, 1, SIZE, SIZE, dtype=torch.uint8),
+    ],
     ids=["channels", "rank", "integer"],
 )
 def test_input_that_is_no_fringe_image(fringe):
@@ -113,7 +131,11 @@ def test_input_that_is_no_fringe_image(fringe):
     ("name", "options", "match"),
     [
         ("vnet", {}, "unknown network 'vnet'; there are unet, transunet"),
-        ("unet", {"widht": 8}, "'unet' has no option 'widht'; there are: width .default 64.*dropout"),
+        (
+            "unet",
+            {"widht": 8},
+            "'unet' has no option 'widht'; there are: width .default 64.*dropout",
+        ),
         ("unet", {"width": 0}, "width must be a whole number, 1 to 4096; it was 0"),
         ("unet", {"width": 8.5}, "width"),
         ("unet", {"width": True}, "width"),
@@ -144,7 +166,8 @@ def test_discriminator_features():
 
 
 def test_no_batch_or_sample_leaks_into_another():
-    """Networks with instance normalisation treat samples one by one, so a batch equals its samples."""
+    """Networks with instance normalisation treat samples one by one, so a batch equals its
+    samples."""
     x = torch.rand(3, 1, SIZE, SIZE)
     for name in ("unet", "transunet", "pix2pix", "pix2pix_unet"):
         network = build(name, **SMALL[name])

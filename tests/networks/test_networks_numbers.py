@@ -1,4 +1,5 @@
-"""The networks' blocks against closed forms, and gradients where a normalisation has nothing to divide by."""
+"""The networks' blocks against closed forms, and gradients where a normalisation has nothing to
+divide by."""
 
 import pytest
 import torch
@@ -44,7 +45,9 @@ def test_every_parameter_learns(name):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_training_in_channels_last_has_the_gradients_of_float64(name):
-    network = build(name, **SMALL[name]).eval()  # without DropPath; normalisation over the batch by its first values
+    network = build(
+        name, **SMALL[name]
+    ).eval()  # without DropPath; normalisation over the batch by its first values
     assert trains_channels_last(network) == (name != "resunet")  # 1 x 1 convolutions with a stride
     fringe, target = torch.rand(2, 1, 64, 64), torch.rand(2, 1, 64, 64)
 
@@ -56,17 +59,27 @@ def test_training_in_channels_last_has_the_gradients_of_float64(name):
     exact = gradient(torch.float64)
     if trains_channels_last(network):
         network.to(memory_format=torch.channels_last)
-    # A ReLU whose input is a rounding from 0 may fall on the other side: single weights may be off by more.
+    # A ReLU whose input is a rounding from 0 may fall on the other side: single weights may be off
+    # by more.
     assert (gradient(torch.float32) - exact).norm() < 1e-2 * exact.norm()
 
 
-@pytest.mark.parametrize(("affine", "layout"), [(False, torch.channels_last), (True, torch.contiguous_format)])
+@pytest.mark.parametrize(
+    ("affine", "layout"), [(False, torch.channels_last), (True, torch.contiguous_format)]
+)
 def test_instance_norm_is_torchs(affine, layout):
-    ours, torchs = (InstanceNorm(3, affine=affine).double(), nn.InstanceNorm2d(3, affine=affine).double())
+    ours, torchs = (
+        InstanceNorm(3, affine=affine).double(),
+        nn.InstanceNorm2d(3, affine=affine).double(),
+    )
     for parameter in ours.parameters():
         nn.init.normal_(parameter)
     torchs.load_state_dict(ours.state_dict())
-    x = (5.0 + torch.randn(2, 3, 6, 4, dtype=torch.float64)).to(memory_format=layout).requires_grad_()
+    x = (
+        (5.0 + torch.randn(2, 3, 6, 4, dtype=torch.float64))
+        .to(memory_format=layout)
+        .requires_grad_()
+    )
     torch.testing.assert_close(ours(x), torchs(x), rtol=1e-12, atol=1e-12)
     weight = torch.randn_like(x)
     our_gradients = torch.autograd.grad((ours(x) * weight).sum(), [x, *ours.parameters()])
@@ -77,8 +90,11 @@ def test_instance_norm_is_torchs(affine, layout):
 
 def test_a_large_offset_costs_no_digits():
     x = torch.randn(1, 2, 16, 16, dtype=torch.float64) + 1000.0
-    # float32 numbers near 1000 are 2**-14 apart: a pixel is off by half of that, the mean by less, and the spread is 1.
-    torch.testing.assert_close(InstanceNorm(2)(x.float()).double(), InstanceNorm(2)(x), rtol=0, atol=2**-14)
+    # float32 numbers near 1000 are 2**-14 apart: a pixel is off by half of that, the mean by less,
+    # and the spread is 1.
+    torch.testing.assert_close(
+        InstanceNorm(2)(x.float()).double(), InstanceNorm(2)(x), rtol=0, atol=2**-14
+    )
 
 
 def _normed(x: Tensor, norm: nn.Module) -> Tensor:
@@ -96,7 +112,9 @@ def test_unet_block_is_two_convolutions_normed_and_cut_at_zero():
     x = torch.randn(2, 2, 9, 7, dtype=torch.float64)
     expected = x
     for convolution, norm in ((block[0], block[1]), (block[3], block[4])):
-        expected = _normed(functional.conv2d(expected, convolution.weight, padding=1), norm).clamp_min(0)
+        expected = _normed(
+            functional.conv2d(expected, convolution.weight, padding=1), norm
+        ).clamp_min(0)
     torch.testing.assert_close(block(x), expected, rtol=1e-10, atol=1e-10)
 
 
@@ -107,9 +125,13 @@ def test_attention_is_a_plain_softmax():
     mixed = []
     for head in range(3):
         part = slice(4 * head, 4 * head + 4)
-        scores = q[..., part] @ k[..., part].transpose(1, 2) / 2.0  # square root of the head's 4 channels
+        scores = (
+            q[..., part] @ k[..., part].transpose(1, 2) / 2.0
+        )  # square root of the head's 4 channels
         mixed.append(torch.softmax(scores, dim=-1) @ v[..., part])
-    torch.testing.assert_close(attention(tokens), attention.out(torch.cat(mixed, dim=-1)), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        attention(tokens), attention.out(torch.cat(mixed, dim=-1)), rtol=1e-10, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("skip_first", [True, False])

@@ -6,7 +6,12 @@ import torch
 from tiny_network import one_thread  # noqa: F401
 
 from fpp_ml_bench.baselines.networks.model import build
-from fpp_ml_bench.baselines.networks.unet import GUIDED_CHANNELS, ORDERS, PhaseGuide, re_projection_loss
+from fpp_ml_bench.baselines.networks.unet import (
+    GUIDED_CHANNELS,
+    ORDERS,
+    PhaseGuide,
+    re_projection_loss,
+)
 from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.errors import NetworkError
@@ -59,7 +64,12 @@ def test_re_projection_sees_the_phase_and_not_the_order():
         assert torch.isfinite(prediction.grad).all() and not prediction.grad[..., :8].any()
         return loss.item()
 
-    assert loss_of(0.0) == loss_of(TAU) == loss_of(0.0, background_mm=-300.0) == pytest.approx(0, abs=1e-12)
+    assert (
+        loss_of(0.0)
+        == loss_of(TAU)
+        == loss_of(0.0, background_mm=-300.0)
+        == pytest.approx(0, abs=1e-12)
+    )
     for shift in (0.1, -0.7, np.pi):
         assert loss_of(shift) == pytest.approx(1 - np.cos(shift), rel=1e-9)
     assert re_projection_loss(tensors, true_mm, torch.zeros_like(true_mm), 750.0) == 0

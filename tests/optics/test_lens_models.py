@@ -1,4 +1,5 @@
-"""The lens models beyond five coefficients: against OpenCV, closed forms of their folds, torch, and rig files."""
+"""The lens models beyond five coefficients: against OpenCV, closed forms of their folds, torch, and
+rig files."""
 
 from dataclasses import replace
 
@@ -8,17 +9,42 @@ import pytest
 
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.pinhole import Pinhole, distort, distortion_polynomial, fold_radius_squared, undistort
+from fpp_ml_bench.optics.pinhole import (
+    Pinhole,
+    distort,
+    distortion_polynomial,
+    fold_radius_squared,
+    undistort,
+)
 from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
-SPREAD = np.array([0.2, 0.06, 0.003, 0.003, 0.02, 0.1, 0.05, 0.02, 0.003, 0.003, 0.003, 0.003, 0.1, 0.1])
+SPREAD = np.array(
+    [0.2, 0.06, 0.003, 0.003, 0.02, 0.1, 0.05, 0.02, 0.003, 0.003, 0.003, 0.003, 0.1, 0.1]
+)
 COUNTS = (4, 5, 8, 12, 14)
-TILTED = (-0.21, 0.11, 0.0013, -0.0021, -0.02, 0.05, -0.03, 0.01, 0.002, -0.001, 0.0015, 0.0007, 0.06, -0.09)
+TILTED = (
+    -0.21,
+    0.11,
+    0.0013,
+    -0.0021,
+    -0.02,
+    0.05,
+    -0.03,
+    0.01,
+    0.002,
+    -0.001,
+    0.0015,
+    0.0007,
+    0.06,
+    -0.09,
+)
 
 
 def _lens(rng, count):
     """A random lens, and points (x, y) that it images."""
-    lens = Pinhole(100, 100, 90.0, 90.0, 50.0, 50.0, tuple(rng.normal(size=count) * SPREAD[:count])).distortion
+    lens = Pinhole(
+        100, 100, 90.0, 90.0, 50.0, 50.0, tuple(rng.normal(size=count) * SPREAD[:count])
+    ).distortion
     radius = rng.uniform(0, min(0.6, 0.9 * np.sqrt(fold_radius_squared(lens))), 200)
     angle = rng.uniform(0, 2 * np.pi, 200)
     return lens, radius * np.cos(angle), radius * np.sin(angle)
@@ -30,8 +56,12 @@ def test_projection_is_opencvs(count):
     for _ in range(50):
         lens, x, y = _lens(rng, count)
         points = np.stack([x, y, np.ones_like(x)], axis=-1)
-        expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(lens[:count]))
-        np.testing.assert_allclose(np.stack(distort(x, y, lens), axis=-1), expected[:, 0], atol=1e-14)
+        expected, _ = cv2.projectPoints(
+            points, np.zeros(3), np.zeros(3), np.eye(3), np.array(lens[:count])
+        )
+        np.testing.assert_allclose(
+            np.stack(distort(x, y, lens), axis=-1), expected[:, 0], atol=1e-14
+        )
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -78,7 +108,9 @@ def test_a_lens_with_a_pole_images_everything_before_it():
     lens = _rational(k4=-4.0)
     distorted = np.array([0.1, 1.0, 10.0])
     ideal, _ = undistort(distorted, np.zeros(3), lens)
-    np.testing.assert_allclose(ideal, (np.sqrt(1 + 16 * distorted**2) - 1) / (8 * distorted), rtol=1e-12)
+    np.testing.assert_allclose(
+        ideal, (np.sqrt(1 + 16 * distorted**2) - 1) / (8 * distorted), rtol=1e-12
+    )
 
 
 def test_rays_that_miss_a_tilted_sensor_have_no_image():
@@ -92,7 +124,9 @@ def test_torch_tensors_pass_through_the_model():
     x, y = np.random.default_rng(2).uniform(-0.4, 0.4, (2, 50))
     tensors = [torch.tensor(values, requires_grad=True) for values in (x, y)]
     moved = distortion_polynomial(*tensors, TILTED)
-    np.testing.assert_allclose([m.detach().numpy() for m in moved], distort(x, y, TILTED), atol=1e-15)
+    np.testing.assert_allclose(
+        [m.detach().numpy() for m in moved], distort(x, y, TILTED), atol=1e-15
+    )
     moved[0].sum().backward()
     assert all(torch.isfinite(t.grad).all() for t in tensors)
 
@@ -106,6 +140,14 @@ def test_rig_files_round_trip(tmp_path, count):
 
 
 def test_four_coefficients_become_five_and_other_numbers_are_refused():
-    assert Pinhole(10, 10, 9.0, 9.0, 5.0, 5.0, (0.1, 0.2, 0.3, 0.4)).distortion == (0.1, 0.2, 0.3, 0.4, 0.0)
-    with pytest.raises(RigError, match="distortion: expected 4 or 5 or 8 or 12 or 14 numbers, got 6"):
+    assert Pinhole(10, 10, 9.0, 9.0, 5.0, 5.0, (0.1, 0.2, 0.3, 0.4)).distortion == (
+        0.1,
+        0.2,
+        0.3,
+        0.4,
+        0.0,
+    )
+    with pytest.raises(
+        RigError, match="distortion: expected 4 or 5 or 8 or 12 or 14 numbers, got 6"
+    ):
         Pinhole(10, 10, 9.0, 9.0, 5.0, 5.0, (0.1,) * 6)

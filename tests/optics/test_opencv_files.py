@@ -1,4 +1,5 @@
-"""Calibrations in OpenCV's files: the names of several tools, round trips, and files that must be refused."""
+"""Calibrations in OpenCV's files: the names of several tools, round trips, and files that must be
+refused."""
 
 import math
 import random
@@ -9,11 +10,17 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, read_opencv_calibration, write_opencv_calibration
+from fpp_ml_bench.optics.opencv_files import (
+    OpenCvCalibration,
+    read_opencv_calibration,
+    write_opencv_calibration,
+)
 from fpp_ml_bench.optics.pinhole import Pinhole
 
 CAMERA = Pinhole(640, 480, 800.1, 801.7, 319.3, 241.9, (-0.1, 0.02, 0.001, -0.002, 0.01))
-PROJECTOR = Pinhole(912, 1140, 1500.5, 1501.25, 455.5, 1100.0, (0.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.01, -0.01))
+PROJECTOR = Pinhole(
+    912, 1140, 1500.5, 1501.25, 455.5, 1100.0, (0.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.01, -0.01)
+)
 TURN = cv2.Rodrigues(np.array([0.1, -0.3, 0.05]))[0]
 T_MM = np.array([-145.28, -36.498, 67.923])
 VALUES = {
@@ -60,18 +67,28 @@ def test_opencvs_names(tmp_path, suffix):
 
 @pytest.mark.parametrize("names", [SLSTUDIO, PROCAMCALIB, OPENCV])
 def test_other_names(tmp_path, names):
-    matrices = dict(zip(names, (VALUES[name] for name in ("M1", "D1", "M2", "D2", "R", "T")), strict=True))
+    matrices = dict(
+        zip(names, (VALUES[name] for name in ("M1", "D1", "M2", "D2", "R", "T")), strict=True)
+    )
     errors = {"cam_error": 0.28, "proj_error": 0.46, "stereo_error": 0.42}
     expected = read_opencv_calibration(write(tmp_path / "a.xml", VALUES))
     expected = replace(expected, errors_px=(0.28, 0.46, 0.42))
     bare = write(tmp_path / "b.xml", {**matrices, **errors})
-    assert read_opencv_calibration(bare, camera_size=(640, 480), projector_size=(912, 1140)) == expected
+    assert (
+        read_opencv_calibration(bare, camera_size=(640, 480), projector_size=(912, 1140))
+        == expected
+    )
     sizes = {"frameWidth": 640, "frameHeight": 480, "screenResX": 912, "screenResY": 1140}
-    assert read_opencv_calibration(write(tmp_path / "c.yml", {**matrices, **errors, **sizes})) == expected
+    assert (
+        read_opencv_calibration(write(tmp_path / "c.yml", {**matrices, **errors, **sizes}))
+        == expected
+    )
 
 
 def test_a_translation_in_metres(tmp_path):
-    read = read_opencv_calibration(write(tmp_path / "a.yml", changed(T=T_MM[None] / 1000)), unit="m")
+    read = read_opencv_calibration(
+        write(tmp_path / "a.yml", changed(T=T_MM[None] / 1000)), unit="m"
+    )
     np.testing.assert_allclose(read.translation_m, T_MM / 1000, rtol=1e-15)
 
 
@@ -79,16 +96,25 @@ def test_a_rotation_in_float32_becomes_an_exact_one(tmp_path):
     rounded = TURN.astype(np.float32)
     read = read_opencv_calibration(write(tmp_path / "a.xml", changed(R=rounded)))
     matrix = np.array(read.rotation)
-    assert np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-15 < np.abs(rounded.astype(float) - TURN).max()
+    assert (
+        np.abs(matrix @ matrix.T - np.eye(3)).max()
+        < 1e-15
+        < np.abs(rounded.astype(float) - TURN).max()
+    )
     np.testing.assert_allclose(matrix, TURN, atol=1e-7)
 
 
 @pytest.mark.parametrize("suffix", ["xml", "yaml", "yml", "json"])
 def test_writing_and_reading_gives_equal_numbers(tmp_path, suffix):
     rng = np.random.default_rng(3)
-    for unit, translation in (("mm", tuple((rng.normal(size=3) * 100 / 1000).tolist())), ("m", (1 / 3, 1e-17, -0.1))):
+    for unit, translation in (
+        ("mm", tuple((rng.normal(size=3) * 100 / 1000).tolist())),
+        ("m", (1 / 3, 1e-17, -0.1)),
+    ):
         turn = tuple(tuple(row) for row in TURN.tolist())
-        calibration = OpenCvCalibration(CAMERA, PROJECTOR, turn, translation, (0.1 + 0.2, None, 5e-324))
+        calibration = OpenCvCalibration(
+            CAMERA, PROJECTOR, turn, translation, (0.1 + 0.2, None, 5e-324)
+        )
         path = tmp_path / f"calibration.{suffix}"
         write_opencv_calibration(calibration, path, unit)
         read = read_opencv_calibration(path, unit=unit)
@@ -99,7 +125,9 @@ def test_writing_and_reading_gives_equal_numbers(tmp_path, suffix):
 
 
 def test_the_written_file_is_a_stereo_calibration_for_opencv(tmp_path):
-    write_opencv_calibration(read_opencv_calibration(write(tmp_path / "a.xml", VALUES)), tmp_path / "b.yml")
+    write_opencv_calibration(
+        read_opencv_calibration(write(tmp_path / "a.xml", VALUES)), tmp_path / "b.yml"
+    )
     storage = cv2.FileStorage(str(tmp_path / "b.yml"), cv2.FILE_STORAGE_READ)
     for name in ("M1", "D1", "M2", "D2", "R", "T"):
         np.testing.assert_allclose(storage.getNode(name).mat(), VALUES[name], rtol=1e-15)
@@ -110,16 +138,28 @@ def test_the_written_file_is_a_stereo_calibration_for_opencv(tmp_path):
     [
         (changed(M1=None), "camera matrix: expected a node M1 or cameraMatrix1.*found D1, M2"),
         (changed(Kc=VALUES["M1"]), "camera matrix.*found M1 and Kc; keep one"),
-        (changed(R=np.array([[0.1, 0.2, 0.3]])), r"R .*expected 3 x 3 numbers, found shape \(1, 3\)"),
+        (
+            changed(R=np.array([[0.1, 0.2, 0.3]])),
+            r"R .*expected 3 x 3 numbers, found shape \(1, 3\)",
+        ),
         (changed(R="none"), "R .rotation.: expected a matrix, found none"),
         (changed(D1=np.zeros((2, 3))), "D1 .*expected a vector"),
-        (changed(D1=np.zeros((1, 6))), "camera: distortion: expected 4 or 5 or 8 or 12 or 14 numbers, got 6"),
+        (
+            changed(D1=np.zeros((1, 6))),
+            "camera: distortion: expected 4 or 5 or 8 or 12 or 14 numbers, got 6",
+        ),
         (changed(M2=VALUES["M2"] * [[1], [np.nan], [1]]), "M2 .*expected finite"),
         (changed(T=np.zeros((3, 1))), "translation is zero"),
-        (changed(M1=VALUES["M1"] + [[0, 3, 0], [0, 0, 0], [0, 0, 0]]), "camera matrix: expected fx 0 cx.*no skew"),
+        (
+            changed(M1=VALUES["M1"] + [[0, 3, 0], [0, 0, 0], [0, 0, 0]]),
+            "camera matrix: expected fx 0 cx.*no skew",
+        ),
         (changed(R=TURN + 1e-3), "rotation: not orthonormal.*may be 1e-05"),
         (changed(R=TURN * [[1], [1], [-1]]), "rotation: determinant is -1"),
-        (changed(imageSize1=None), r"size of the camera is not stored.*camera_size=\(width, height\)"),
+        (
+            changed(imageSize1=None),
+            r"size of the camera is not stored.*camera_size=\(width, height\)",
+        ),
         (changed(imageSize2=[912.5, 1140]), "size of the projector: expected width and height"),
         (changed(cam_error="small"), "cam_error: expected a reprojection error in px"),
     ],
@@ -161,10 +201,15 @@ def test_files_that_are_no_calibration_are_refused(tmp_path, content, message):
     [
         (
             "ros.yaml",
-            "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [8, 0, 3, 0, 8, 2, 0, 0, 1]\n",
+            "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [8, 0, 3, 0, 8, 2, 0, "
+            "0, 1]\n",
             "image_width, camera_matrix",
         ),
-        ("flow.yml", "camera: {K: [800, 0, 320, 0, 800, 240, 0, 0, 1], D: [0, 0, 0, 0, 0]}\n", "camera"),
+        (
+            "flow.yml",
+            "camera: {K: [800, 0, 320, 0, 800, 240, 0, 0, 1], D: [0, 0, 0, 0, 0]}\n",
+            "camera",
+        ),
         ("alone.json", '{\n\t"camera": {"K": [[800, 0], [0]], "D": null}}', "camera"),
     ],
 )
@@ -173,8 +218,10 @@ def test_a_sound_file_of_another_layout_is_not_called_damaged(tmp_path, name, co
     with pytest.raises(RigError) as caught:
         read_opencv_calibration(tmp_path / name)
     assert str(caught.value) == (
-        f"{tmp_path / name}: is well-formed, but of another layout: expected the nodes M1, D1, M2, D2, R, T (OpenCV's "
-        f"matrices), found the keys {keys}; give the numbers in the rig file's own entries (camera, projector, "
+        f"{tmp_path / name}: is well-formed, but of another layout: expected the nodes M1, D1, M2, "
+        f"D2, R, T (OpenCV's "
+        f"matrices), found the keys {keys}; give the numbers in the rig file's own entries "
+        f"(camera, projector, "
         "rotation, translation_m), or write the file by cv2.FileStorage"
     )
 
@@ -183,15 +230,24 @@ def test_arguments_that_contradict_or_make_no_sense_are_refused(tmp_path):
     path = write(tmp_path / "a.xml", VALUES)
     for arguments, message in (
         ({"unit": "inch"}, "unit: expected mm or m, got 'inch'"),
-        ({"camera_size": (320, 240)}, r"camera_size is given as \(320, 240\), but the file says \(640, 480\)"),
+        (
+            {"camera_size": (320, 240)},
+            r"camera_size is given as \(320, 240\), but the file says \(640, 480\)",
+        ),
     ):
         with pytest.raises(RigError, match=message):
             read_opencv_calibration(path, **arguments)
-    for wrong, message in ((tmp_path, "not a regular file but a folder"), (tmp_path / "absent.xml", "No such file")):
+    for wrong, message in (
+        (tmp_path, "not a regular file but a folder"),
+        (tmp_path / "absent.xml", "No such file"),
+    ):
         with pytest.raises(RigError, match=message):
             read_opencv_calibration(wrong)
     calibration = read_opencv_calibration(path)
-    for out, message in ((tmp_path / "a.txt", "ending in"), (tmp_path / "no" / "a.xml", "can't be written")):
+    for out, message in (
+        (tmp_path / "a.txt", "ending in"),
+        (tmp_path / "no" / "a.xml", "can't be written"),
+    ):
         with pytest.raises(RigError, match=message):
             write_opencv_calibration(calibration, out)
 

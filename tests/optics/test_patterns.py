@@ -6,7 +6,12 @@ import pytest
 
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.patterns import export_patterns, pattern_image, pattern_profile, pattern_profiles
+from fpp_ml_bench.optics.patterns import (
+    export_patterns,
+    pattern_image,
+    pattern_profile,
+    pattern_profiles,
+)
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Sequence
@@ -39,7 +44,9 @@ def test_images_vary_along_the_right_axis_and_agree_with_the_profiles():
         image, profile = pattern_image(SMALL, frame.index), pattern_profile(SMALL, frame.index)
         assert image.shape == (48, 64) and image.dtype == np.uint8
         lines = image.T if frame.direction == "horizontal" else image
-        assert (lines == lines[0]).all() and np.array_equal(lines[0], np.broadcast_to(profile, lines[0].shape))
+        assert (lines == lines[0]).all() and np.array_equal(
+            lines[0], np.broadcast_to(profile, lines[0].shape)
+        )
         assert np.array_equal(table[frame.index, : len(profile)], profile)
         assert (table[frame.index, len(profile) :] == profile[-1]).all()
     assert pattern_image(SMALL, SMALL.sequence.black).max() == 0

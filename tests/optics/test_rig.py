@@ -27,20 +27,33 @@ def test_paper_rig_has_the_papers_numbers():
     assert rig.camera.fx == pytest.approx(2285.77, abs=0.01) == rig.camera.fy
     assert (rig.projector.width, rig.projector.height, rig.projector.fx) == (912, 1140, 1824.0)
     assert rig.baseline_m == pytest.approx(0.160, abs=1e-3)
-    assert (-rig.R.T @ rig.t).tolist() == [-0.125, 0.1, 0.0]  # 0.125 m to the camera's left, 0.1 m below (y is down)
-    # Fringe periods in the working range and image px a period, worked out by hand from the geometry.
-    assert rig.periods_in_range("vertical") == pytest.approx(1824 * 0.125 * (1 / 1.5 - 1 / 2.1) / 18, rel=1e-12)
-    assert rig.periods_in_range("horizontal") == pytest.approx(1824 * 0.1 * (1 / 1.5 - 1 / 2.1) / 18, rel=1e-12)
+    assert (-rig.R.T @ rig.t).tolist() == [
+        -0.125,
+        0.1,
+        0.0,
+    ]  # 0.125 m to the camera's left, 0.1 m below (y is down)
+    # Fringe periods in the working range and image px a period, worked out by hand from the
+    # geometry.
+    assert rig.periods_in_range("vertical") == pytest.approx(
+        1824 * 0.125 * (1 / 1.5 - 1 / 2.1) / 18, rel=1e-12
+    )
+    assert rig.periods_in_range("horizontal") == pytest.approx(
+        1824 * 0.1 * (1 / 1.5 - 1 / 2.1) / 18, rel=1e-12
+    )
     assert rig.image_px_per_period("vertical") == pytest.approx(18 * rig.camera.fx / 1824, rel=1e-9)
 
 
 def test_scaling_keeps_the_field_and_the_projector():
     rig = paper_rig(960)
     small = rig.scaled(240)
-    assert small == paper_rig(240) and small.projector == rig.projector and small.camera.height == 240
+    assert (
+        small == paper_rig(240) and small.projector == rig.projector and small.camera.height == 240
+    )
     # The image's borders, at -0.5 and W - 0.5, see the same directions at every size.
     for device in (rig.camera, small.camera):
-        assert device.normalised(-0.5, device.height - 0.5) == pytest.approx((-0.209995, 0.209995), abs=1e-9)
+        assert device.normalised(-0.5, device.height - 0.5) == pytest.approx(
+            (-0.209995, 0.209995), abs=1e-9
+        )
 
 
 @pytest.mark.parametrize("size, refused", [(160, True), (170, True), (171, False), (960, False)])
@@ -62,7 +75,15 @@ def test_projection_matches_opencv():
     rng = np.random.default_rng(3)
     points = rng.uniform((-0.4, -0.3, 1.5), (0.4, 0.3, 2.1), (200, 3))
     turn, shift = np.array([0.1, -0.2, 0.05]), np.array([0.12, -0.1, 0.03])
-    rig = Rig(paper_rig(240).camera, CAMERA, rotation_matrix(tuple(turn)), shift, 4.0, 4.0, Sequence(4, 5, 5))
+    rig = Rig(
+        paper_rig(240).camera,
+        CAMERA,
+        rotation_matrix(tuple(turn)),
+        shift,
+        4.0,
+        4.0,
+        Sequence(4, 5, 5),
+    )
     matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
     expected, _ = cv2.projectPoints(points, turn, shift, matrix, np.array(DISTORTION))
     np.testing.assert_allclose(np.stack(rig.project(points), axis=-1), expected[:, 0], atol=1e-9)
@@ -75,7 +96,9 @@ def test_rays_match_opencv_and_project_back():
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-14)
-    expected = cv2.undistortPoints(pixels, matrix, np.array(DISTORTION), criteria=criteria).reshape(45, 60, 2)
+    expected = cv2.undistortPoints(pixels, matrix, np.array(DISTORTION), criteria=criteria).reshape(
+        45, 60, 2
+    )
     np.testing.assert_allclose(np.stack([x, y], axis=-1), expected, atol=1e-9)
     back = np.stack(CAMERA.pixels(x, y), axis=-1)
     np.testing.assert_allclose(back, np.stack([u, v], axis=-1), atol=1e-9)
@@ -90,13 +113,24 @@ def test_points_behind_a_device_have_no_image():
 @given(vector=st.tuples(*[st.floats(-3, 3)] * 3))
 @settings(max_examples=60, deadline=None)
 def test_rotation_vectors_are_opencvs(vector):
-    np.testing.assert_allclose(rotation_matrix(vector), cv2.Rodrigues(np.array(vector))[0], atol=1e-13)
+    np.testing.assert_allclose(
+        rotation_matrix(vector), cv2.Rodrigues(np.array(vector))[0], atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "yml", "json"])
 def test_files_round_trip_to_the_last_bit(tmp_path, suffix):
     turn = rotation_matrix((0.1, 1e-9, -0.3))
-    rig = Rig(CAMERA, paper_rig().projector, turn, (1 / 3, 1e-17, -0.1), 17.3, 18.1, Sequence(5, 8, 8), (1500, 2100.5))
+    rig = Rig(
+        CAMERA,
+        paper_rig().projector,
+        turn,
+        (1 / 3, 1e-17, -0.1),
+        17.3,
+        18.1,
+        Sequence(5, 8, 8),
+        (1500, 2100.5),
+    )
     path = tmp_path / f"rig.{suffix}"
     save_rig(rig, path)
     assert load_rig(path) == rig and hash(load_rig(path)) == hash(rig)
@@ -107,7 +141,9 @@ def test_a_rotation_vector_is_taken(tmp_path):
     data = paper_rig().to_dict()
     data["rotation"] = [0.0, 0.1, 0.0]
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(data))
-    np.testing.assert_allclose(load_rig(tmp_path / "rig.yaml").R[0], [np.cos(0.1), 0, np.sin(0.1)], atol=1e-15)
+    np.testing.assert_allclose(
+        load_rig(tmp_path / "rig.yaml").R[0], [np.cos(0.1), 0, np.sin(0.1)], atol=1e-15
+    )
 
 
 def _changed(path: str, value: object) -> dict:
@@ -182,12 +218,25 @@ def test_missing_file_and_unwritable_folder_are_rig_errors(tmp_path):
     [
         (
             {"translation_m": [200, 0, 0]},
-            "translation_m gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: divide by 1000",
+            "translation_m gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: "
+            "divide by 1000",
         ),
-        ({"translation_m": [0.0002, 0, 0]}, "translation_m gives a baseline of 0.2 mm, .*; check its numbers"),
-        ({"translation_m": [1e6, 0, 0]}, "translation_m gives a baseline of 1e.06 m, .*; check its numbers"),
-        ({"working_range_mm": [0.5, 1.5]}, r"working_range_mm: 0.5 to 1.5 mm, .*like metres: write \[500, 1500\]"),
-        ({"working_range_mm": [2e6, 3e6]}, r"working_range_mm: 2e\+06 to 3e\+06 mm, .*; check its unit, mm"),
+        (
+            {"translation_m": [0.0002, 0, 0]},
+            "translation_m gives a baseline of 0.2 mm, .*; check its numbers",
+        ),
+        (
+            {"translation_m": [1e6, 0, 0]},
+            "translation_m gives a baseline of 1e.06 m, .*; check its numbers",
+        ),
+        (
+            {"working_range_mm": [0.5, 1.5]},
+            r"working_range_mm: 0.5 to 1.5 mm, .*like metres: write \[500, 1500\]",
+        ),
+        (
+            {"working_range_mm": [2e6, 3e6]},
+            r"working_range_mm: 2e\+06 to 3e\+06 mm, .*; check its unit, mm",
+        ),
     ],
 )
 def test_lengths_in_a_unit_that_no_rig_has_are_refused(tmp_path, changes, message):
@@ -233,7 +282,10 @@ def test_a_calibration_read_in_the_wrong_unit_is_refused(tmp_path, stored, unit,
 
 def test_a_calibrated_rig_is_checked_by_what_gave_its_lengths():
     data = {**paper_rig().to_dict(), "translation_m": [0.0002, 0, 0]}
-    expected = "^the spacing gives a baseline of 0.2 mm, .* as metres it would be 200 mm: multiply by 1000$"
+    expected = (
+        "^the spacing gives a baseline of 0.2 mm, .* as metres it would be 200 mm: multiply by "
+        "1000$"
+    )
     with pytest.raises(RigError, match=expected):
         check_lengths(rig_from_dict(data), "the spacing")
     for length in (0.005, 20.0):
@@ -243,8 +295,14 @@ def test_a_calibrated_rig_is_checked_by_what_gave_its_lengths():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"translation_m": [0.0, 0.0, 0.005]}, "translation_m gives a baseline that tells no depth: .*, by 7.8"),
-        ({"working_range_mm": [2e5, 3e5], "standoff_m": 250.0, "background_m": None}, "far end, 300000 mm, by 1"),
+        (
+            {"translation_m": [0.0, 0.0, 0.005]},
+            "translation_m gives a baseline that tells no depth: .*, by 7.8",
+        ),
+        (
+            {"working_range_mm": [2e5, 3e5], "standoff_m": 250.0, "background_m": None},
+            "far end, 300000 mm, by 1",
+        ),
     ],
     ids=["short, on the axis", "far away"],
 )
@@ -272,7 +330,12 @@ def test_a_code_along_the_baseline_alone_is_refused():
 
 
 def test_a_projector_that_looks_away_is_refused():
-    away = Rig(paper_rig().camera, paper_rig().projector, rotation_matrix((0.0, np.pi, 0.0)), (0.1, 0.0, 0.0))
+    away = Rig(
+        paper_rig().camera,
+        paper_rig().projector,
+        rotation_matrix((0.0, np.pi, 0.0)),
+        (0.1, 0.0, 0.0),
+    )
     with pytest.raises(RigError, match="does not look at"):
         away.check_sampling()
 
@@ -285,7 +348,13 @@ def test_a_nearly_singular_intrinsic_matrix_is_refused(intrinsics):
 
 
 def test_a_lens_that_flattens_out_is_inverted_wherever_it_has_an_inverse():
-    coefficients = (0.6, 0.9, 0.0, 0.0, -0.3)  # Newton from the distorted point misses some of these
+    coefficients = (
+        0.6,
+        0.9,
+        0.0,
+        0.0,
+        -0.3,
+    )  # Newton from the distorted point misses some of these
     ideal = np.linspace(0.01, 0.98, 400) * np.sqrt(fold_radius_squared(coefficients))
     distorted = distort(ideal, np.zeros_like(ideal), coefficients)
     np.testing.assert_allclose(undistort(*distorted, coefficients)[0], ideal, rtol=1e-10)

@@ -1,4 +1,5 @@
-"""The page in headless Chromium: sorting, filters, keyboard, both colour schemes, a phone, and hostile rows."""
+"""The page in headless Chromium: sorting, filters, keyboard, both colour schemes, a phone, and
+hostile rows."""
 
 import os
 from dataclasses import replace
@@ -13,7 +14,13 @@ from scored_dataset import make_dataset
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
-from fpp_ml_bench.leaderboard.ranking import is_trivial, more_than_trivial, rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.ranking import (
+    is_trivial,
+    more_than_trivial,
+    rank,
+    read_entries,
+    shipped_rows,
+)
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 
 HOSTILE = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'>"
@@ -27,13 +34,21 @@ def page(tmp_path_factory):
     files = some_rows(work / "rows", dataset)
     files.append(
         write_result_file(
-            work / "rows" / "bad.json", dataset, 16.0, 1.0, name=HOSTILE, frames_used=[0, 1], timing=timing(4.0, 2)
+            work / "rows" / "bad.json",
+            dataset,
+            16.0,
+            1.0,
+            name=HOSTILE,
+            frames_used=[0, 1],
+            timing=timing(4.0, 2),
         )
     )
     row = work / "row.json"
     assert fpp_bench("leaderboard", files[0], "--row", row) == 0
     with pytest.MonkeyPatch.context() as patch:
-        listed = rows.vouching_line(read_entries([row])[0].row, row.read_bytes(), "verified", "fpp-eval verify")
+        listed = rows.vouching_line(
+            read_entries([row])[0].row, row.read_bytes(), "verified", "fpp-eval verify"
+        )
         (work / "vouched.txt").write_text(f"{listed}\n")
         patch.setattr(rows, "VOUCHED", work / "vouched.txt")
         assert fpp_bench("leaderboard", row, *files[1:], "--page", work / "page") == 0
@@ -64,13 +79,20 @@ RANKED = ["Slow and fine", "Fast and rough", "Beaten", HOSTILE[:14]]
 
 
 def test_the_browser_would_tell(browser, tmp_path):
-    """What the other tests rely on: exceptions, console messages and what the policy stops do show up."""
+    """What the other tests rely on: exceptions, console messages and what the policy stops do show
+    up."""
     policy = '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'">'
-    for odd in ("<script>throw 1</script>", "<script>console.log(1)</script>", f"{policy}<img src='x.png'>"):
+    for odd in (
+        "<script>throw 1</script>",
+        "<script>console.log(1)</script>",
+        f"{policy}<img src='x.png'>",
+    ):
         (tmp_path / "odd.html").write_text(f"<!doctype html>{odd}")
         browser.open(tmp_path / "odd.html")
         assert browser.complaints() != []
-    (tmp_path / "odd.html").write_text("<!doctype html><link rel=icon href=data:,><img src='y.png'>")
+    (tmp_path / "odd.html").write_text(
+        "<!doctype html><link rel=icon href=data:,><img src='y.png'>"
+    )
     browser.open(tmp_path / "odd.html")
     assert [address.rsplit("/", 1)[1] for address in browser.requests()] == ["odd.html", "y.png"]
 
@@ -80,7 +102,10 @@ def test_a_click_sorts_and_another_turns_it_round(opened, page):
     assert opened.run(NAMES) == RANKED and opened.run(SORTED) == "ascending"
     opened.click(".ranking button[data-key=ms]")
     assert opened.run(NAMES) == ["Fast and rough", HOSTILE[:14], "Slow and fine", "Beaten"]
-    assert opened.run("document.querySelector('.ranking [data-key=ms]').closest('th').ariaSort") == "ascending"
+    assert (
+        opened.run("document.querySelector('.ranking [data-key=ms]').closest('th').ariaSort")
+        == "ascending"
+    )
     opened.click(".ranking button[data-key=ms]")
     assert opened.run(NAMES) == ["Beaten", "Slow and fine", HOSTILE[:14], "Fast and rough"]
     assert opened.run(SORTED) == "descending"
@@ -92,7 +117,8 @@ def test_a_click_sorts_and_another_turns_it_round(opened, page):
 
 
 def tab_to(browser, condition):
-    """Press the Tab key until the element with the focus fulfils a JavaScript condition on ``e``."""
+    """Press the Tab key until the element with the focus fulfils a JavaScript condition on
+    ``e``."""
     for _ in range(60):
         browser.key("Tab")
         if browser.run(f"(e => {condition})(document.activeElement)"):
@@ -104,7 +130,9 @@ def tab_to(browser, condition):
 def test_keys_alone_reach_everything(opened):
     opened.key("Tab")
     assert opened.run("document.activeElement.className") == "skip"
-    assert opened.run("document.activeElement.getBoundingClientRect().left") >= 0  # seen when focused
+    assert (
+        opened.run("document.activeElement.getBoundingClientRect().left") >= 0
+    )  # seen when focused
     tab_to(opened, "e.id === 'q'")
     opened.type("e")
     assert "q=e" in opened.run("location.hash")
@@ -126,7 +154,14 @@ def test_a_key_opens_what_a_phone_has_no_room_for(browser, page):
     browser.key("Enter", "\r")
     browser.run("new Promise(done => setTimeout(done, 50))")
     shown = browser.run(terms)
-    assert {"95% interval, mm", "Overall MAE, mm", "Time, ms", "Frames", "Code", "Provenance"} <= set(shown)
+    assert {
+        "95% interval, mm",
+        "Overall MAE, mm",
+        "Time, ms",
+        "Frames",
+        "Code",
+        "Provenance",
+    } <= set(shown)
     assert browser.run("document.documentElement.scrollWidth") <= 390
     browser.open(f"{page.resolve().as_uri()}#columns=all", 390, 844)
     opened = "[...document.querySelectorAll('.rest')].every(rest => rest.open)"
@@ -139,19 +174,33 @@ def test_the_first_screen_holds_the_one_frame_table(browser, shipped_page, width
     browser.open(shipped_page, width, 900)
     titles = ["Rank", "Method", "Two-sided MAE, mm"]
     if width > 390:
-        titles += ["95% interval, mm", "Object MAE, mm", "Time, ms", "Phase reliance", "Disturbed, mm"]
+        titles += [
+            "95% interval, mm",
+            "Object MAE, mm",
+            "Time, ms",
+            "Phase reliance",
+            "Disturbed, mm",
+        ]
     assert browser.run(_TITLES) == titles
-    assert browser.run("document.querySelector('.board h2').innerText").startswith("One frame, metric track")
+    assert browser.run("document.querySelector('.board h2').innerText").startswith(
+        "One frame, metric track"
+    )
     bottoms = browser.run(
-        "[...document.querySelectorAll('.ranking tbody tr')].map(r => r.getBoundingClientRect().bottom)"
+        "[...document.querySelectorAll('.ranking tbody tr')].map(r => "
+        "r.getBoundingClientRect().bottom)"
     )
     assert sum(0 < bottom <= 900 for bottom in bottoms) >= (3 if width == 390 else 5)
-    assert browser.run("(box => box.scrollWidth <= box.clientWidth)(document.querySelector('.board .scroll'))")
+    assert browser.run(
+        "(box => box.scrollWidth <= box.clientWidth)(document.querySelector('.board .scroll'))"
+    )
     processors = r"/Xeon|EPYC|AMD|Intel/"
     cells = (
-        f"[...document.querySelectorAll('.ranking tbody tr > *')].filter(c => {processors}.test(c.textContent)).length"
+        f"[...document.querySelectorAll('.ranking tbody tr > *')].filter(c => "
+        f"{processors}.test(c.textContent)).length"
     )
-    assert browser.run(cells) == 0 and "(a) AMD EPYC" in browser.run("document.querySelector('.board p').innerText")
+    assert browser.run(cells) == 0 and "(a) AMD EPYC" in browser.run(
+        "document.querySelector('.board p').innerText"
+    )
 
 
 @pytest.mark.parametrize("width", [390, 900, 1440])
@@ -192,16 +241,23 @@ def test_filters_hide_rows_marks_and_say_so(opened):
     assert opened.run(NAMES) == ["Beaten"] and opened.run(marks) == 1
     assert opened.run("document.getElementById('shown').innerText") == "1 of 5 rows shown"
     assert opened.run("document.getElementById('shown').getAttribute('role')") == "status"
-    assert opened.run("[...document.querySelectorAll('.board')].map(section => section.hidden)") == [False, True]
+    assert opened.run(
+        "[...document.querySelectorAll('.board')].map(section => section.hidden)"
+    ) == [False, True]
     opened.click("#filters button[type=reset]")
     assert opened.run("new Promise(done => setTimeout(done, 20))") is None
     assert opened.run(NAMES) == RANKED
     opened.click("input[value=verified]")
     assert opened.run(NAMES) == [name for name in RANKED if name != "Fast and rough"]
     assert "hide=verified" in opened.run("location.hash")
-    choose = "(s) => { s.value = 'oracle range'; s.dispatchEvent(new Event('input', {bubbles: true})) }"
+    choose = (
+        "(s) => { s.value = 'oracle range'; s.dispatchEvent(new Event('input', {bubbles: true})) }"
+    )
     opened.run(f"({choose})(document.querySelector('select[name=track]'))")
-    assert opened.run(NAMES) == [] and opened.run("document.getElementById('shown').innerText") == "1 of 5 rows shown"
+    assert (
+        opened.run(NAMES) == []
+        and opened.run("document.getElementById('shown').innerText") == "1 of 5 rows shown"
+    )
     assert "track=oracle+range" in opened.run("location.hash")
 
 
@@ -233,11 +289,16 @@ def test_hostile_text_is_shown_and_does_nothing(opened, page):
 def test_every_width_in_both_schemes(browser, page, width, dark):
     for path in (page, sorted((page.parent / "submissions").glob("*.html"))[0]):
         browser.open(path, width, 844, dark)
-        assert browser.run("document.documentElement.scrollWidth") <= width  # only tables scroll sideways
+        assert (
+            browser.run("document.documentElement.scrollWidth") <= width
+        )  # only tables scroll sideways
         assert browser.run(_LEAST_CONTRAST) >= 4.5  # WCAG 2.2, level AA
         assert browser.complaints() == []
     browser.open(page, width, 844, dark)
-    shown = "[...document.querySelectorAll('.scatter')].filter(s => s.getBoundingClientRect().width > 0).length"
+    shown = (
+        "[...document.querySelectorAll('.scatter')].filter(s => s.getBoundingClientRect().width > "
+        "0).length"
+    )
     assert browser.run(shown) == 2  # against time and against frames
 
 
@@ -264,7 +325,8 @@ def test_the_shipped_page_fits(browser, shipped_page, width):
     lines = "e => e.getBoundingClientRect().height / parseFloat(getComputedStyle(e).lineHeight)"
     most_lines = 2 if width == 390 else 1  # beside two other columns
     assert (
-        browser.run(f"Math.max(...[...document.querySelectorAll('.ranking tbody a')].map({lines}))") < most_lines + 0.5
+        browser.run(f"Math.max(...[...document.querySelectorAll('.ranking tbody a')].map({lines}))")
+        < most_lines + 0.5
     )
     assert browser.run("document.querySelector('.links').getBoundingClientRect().height") < 220
 
@@ -274,7 +336,9 @@ def test_labels_of_the_shipped_pictures_are_apart_and_whole(browser, shipped_pag
     browser.open(shipped_page, width)
     browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
     pictures = browser.run(_LABEL_BOXES)
-    datasets = {group.key.data_title for group in more_than_trivial(rank(read_entries(shipped_rows())))}
+    datasets = {
+        group.key.data_title for group in more_than_trivial(rank(read_entries(shipped_rows())))
+    }
     assert len(pictures) == 2 * len(datasets)
     for picture in pictures:
         left, top, right, bottom = picture["frame"]
@@ -282,7 +346,12 @@ def test_labels_of_the_shipped_pictures_are_apart_and_whole(browser, shipped_pag
         for number, box in enumerate(boxes):
             assert left <= box[0] and top <= box[1] and box[2] <= right and box[3] <= bottom
             for placed in boxes[:number]:
-                apart = box[2] <= placed[0] or placed[2] <= box[0] or box[3] <= placed[1] or placed[3] <= box[1]
+                apart = (
+                    box[2] <= placed[0]
+                    or placed[2] <= box[0]
+                    or box[3] <= placed[1]
+                    or placed[3] <= box[1]
+                )
                 assert apart, (box, placed)
 
 
@@ -297,21 +366,30 @@ def axe():
 
 
 def findings(browser, axe) -> list[str]:
-    """What axe finds on the page with all of its details open, as far as it is serious or critical."""
+    """What axe finds on the page with all of its details open, as far as it is serious or
+    critical."""
     browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
     browser.run(f"{axe}; 1")
     heavy = "v => ['serious', 'critical'].includes(v.impact)"
-    return browser.run(f"axe.run().then(r => r.violations.filter({heavy}).map(v => v.id + v.nodes[0].html))")
+    return browser.run(
+        f"axe.run().then(r => r.violations.filter({heavy}).map(v => v.id + v.nodes[0].html))"
+    )
 
 
 @pytest.fixture(scope="module")
 def ranked_page(tmp_path_factory):
     """A page with ranks, pairs and both test sets."""
     work = tmp_path_factory.mktemp("ranked")
-    file = write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0, timing=timing(3.0))
+    file = write_result_file(
+        work / "base.json", make_dataset(work / "tiny"), 1.0, timing=timing(3.0)
+    )
     (base,), full, unseen = read_entries([file]), {"test/depth": "f" * 32}, {"test/depth": "e" * 32}
     entries = []
-    learned = LearnedFrom(data="generated"), LearnedFrom(data="train-split", versions=["a benchmark"]), None
+    learned = (
+        LearnedFrom(data="generated"),
+        LearnedFrom(data="train-split", versions=["a benchmark"]),
+        None,
+    )
     for number, name in enumerate(("first", "second", "third")):
         for objects, data in ((5, full), (20, unseen)):
             errors = {f"{objects} {n}": float((1 + n) * (1 + number)) for n in range(objects)}
@@ -338,15 +416,21 @@ def page_with_samples(tmp_path_factory):
 @pytest.mark.parametrize("width", [390, 900, 1440])
 def test_pictures_of_predictions_are_shown_whole(browser, page_with_samples, width):
     browser.open(page_with_samples, width)
-    assert browser.run("[...document.querySelectorAll('img.panels')].map(image => image.naturalWidth > 1000)") == [
+    assert browser.run(
+        "[...document.querySelectorAll('img.panels')].map(image => image.naturalWidth > 1000)"
+    ) == [
         True,
         True,
     ]
-    assert browser.run("document.documentElement.scrollWidth") <= width and browser.complaints() == []
+    assert (
+        browser.run("document.documentElement.scrollWidth") <= width and browser.complaints() == []
+    )
 
 
 def test_axe_finds_nothing(browser, axe, page, ranked_page, page_with_samples):
-    (broken := ranked_page.with_name("broken.html")).write_text("<!doctype html><html><body><input></body></html>")
+    (broken := ranked_page.with_name("broken.html")).write_text(
+        "<!doctype html><html><body><input></body></html>"
+    )
     browser.open(broken)
     assert findings(browser, axe)  # or the check could not fail
     own_page = next((ranked_page.parent / "submissions").glob("*.html"))
@@ -363,18 +447,26 @@ def test_axe_finds_nothing(browser, axe, page, ranked_page, page_with_samples):
 def test_rows_by_what_they_learned_from(browser, ranked_page):
     browser.open(ranked_page.resolve().as_uri() + "#learned=train-split")
     assert browser.run(NAMES) == ["second"]
-    column = "[...document.querySelectorAll('.ranking th')].findIndex(head => head.innerText === 'Learned from')"
-    assert browser.run(f"document.querySelector('.ranking tbody tr:not([hidden])').cells[{column}].innerText") == (
-        "train-split"
+    column = (
+        "[...document.querySelectorAll('.ranking th')].findIndex(head => head.innerText === "
+        "'Learned from')"
     )
+    assert browser.run(
+        f"document.querySelector('.ranking tbody tr:not([hidden])').cells[{column}].innerText"
+    ) == ("train-split")
     browser.open(ranked_page.resolve().as_uri() + "#learned=not+said")
     assert browser.run(NAMES) == ["third"]
 
 
 def test_ranks_parts_and_pairs_are_on_the_page(browser, ranked_page):
     browser.open(ranked_page)
-    titles = browser.run("[...document.querySelectorAll('.ranking thead th')].map(head => head.innerText)")
-    cells = "[...document.querySelectorAll('.ranking tbody tr')].map(row => [...row.cells].map(c => c.innerText))"
+    titles = browser.run(
+        "[...document.querySelectorAll('.ranking thead th')].map(head => head.innerText)"
+    )
+    cells = (
+        "[...document.querySelectorAll('.ranking tbody tr')].map(row => [...row.cells].map(c => "
+        "c.innerText))"
+    )
     shown = [dict(zip(titles, row, strict=True)) for row in browser.run(cells)]
     columns = ("Rank", "Object MAE, mm", "On test, mm", "On unseen, mm", "× trivial")
     assert [tuple(row[column] for column in columns) for row in shown] == [
@@ -383,7 +475,9 @@ def test_ranks_parts_and_pairs_are_on_the_page(browser, ranked_page):
         ("3", "27.000", "9.000", "31.500", "1"),
     ]
     browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
-    matrix = browser.run("[...document.querySelectorAll('.matrix tbody td')].map(cell => cell.className)")
+    matrix = browser.run(
+        "[...document.querySelectorAll('.matrix tbody td')].map(cell => cell.className)"
+    )
     assert matrix == ["", "ahead", "ahead", "behind", "", "ahead", "behind", "behind", ""]
     browser.click(".ranking button[data-key=rank]")  # ascending as it is written
     assert browser.run("document.querySelector('.ranking tbody tr td').innerText") == "3"
@@ -421,7 +515,8 @@ box => {
     .map(cell => Math.abs(left(cell) - left(heads[cell.cellIndex]))));
 }
 """
-# Boxes of the labels of every picture that is shown: across as drawn, and a line's height without its leading.
+# Boxes of the labels of every picture that is shown: across as drawn, and a line's height without
+# its leading.
 _LABEL_BOXES = """
 [...document.querySelectorAll("svg.scatter")].filter(svg => svg.getBoundingClientRect().width > 0).map(svg => ({
   frame: (b => [b.left, b.top, b.right, b.bottom])(svg.getBoundingClientRect()),

@@ -1,4 +1,5 @@
-"""The static page as files: the same bytes, no way out of it, and nothing that a submission's text could do."""
+"""The static page as files: the same bytes, no way out of it, and nothing that a submission's text
+could do."""
 
 import html
 import re
@@ -22,7 +23,13 @@ from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import parse_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard.page.page import LogScale, overview, page_files, predicted_samples, slug
+from fpp_ml_bench.leaderboard.page.page import (
+    LogScale,
+    overview,
+    page_files,
+    predicted_samples,
+    slug,
+)
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.optics.named_rigs import paper_rig
@@ -58,7 +65,9 @@ def test_same_rows_same_bytes_whatever_their_order(files, tmp_path):
 
 def test_a_page_ranks_once(files, tmp_path, monkeypatch):
     ranked = []
-    monkeypatch.setattr(leaderboard_command, "rank_files", lambda *given: ranked.append(given) or rank(*given))
+    monkeypatch.setattr(
+        leaderboard_command, "rank_files", lambda *given: ranked.append(given) or rank(*given)
+    )
     assert fpp_bench("leaderboard", *files, "--page", tmp_path, "--csv", tmp_path / "t.csv") == 0
     assert len(ranked) == 1
     words = ["leaderboard", *files, "--page", tmp_path, "--sort", "object_rmse_mm"]
@@ -77,13 +86,18 @@ def test_pages_of_rows_that_left_are_removed_and_nothing_else_is(files, tmp_path
 
 def test_groups_stay_apart_and_the_papers_rows_too(files):
     index = pages(files)["index.html"].decode()
-    metric, oracle = re.findall(r'<section id="[a-z0-9-]+" class="board">.*?</section>', index, flags=re.DOTALL)
+    metric, oracle = re.findall(
+        r'<section id="[a-z0-9-]+" class="board">.*?</section>', index, flags=re.DOTALL
+    )
     assert "Was told" in oracle and "Was told" not in metric and "Fast and rough" not in oracle
     assert "were given the test sample's depth range" in html.unescape(oracle)
     reported = html.unescape(index[index.index("<h2>Reported by others</h2>") :])
     row = re.search(r'<th scope="row">UNet</th>.*?</tr>', reported, re.DOTALL)
     assert re.findall(r"<td[^>]*>(.*?)</td>", row[0])[2:5] == ["14.54", "17.88", "3.31"]
-    assert "Other data, not ranked with the rows above" in reported and "reported by the paper" in index
+    assert (
+        "Other data, not ranked with the rows above" in reported
+        and "reported by the paper" in index
+    )
     assert "TransUNet" not in metric + oracle
 
 
@@ -103,13 +117,19 @@ def test_links_lead_to_the_page_and_nowhere_else(files):
         parsed = Parsed(content.decode())
         ids = {attributes.get("id") for _, attributes in parsed.elements}
         for tag, attributes in parsed.elements:
-            assert not any(key.startswith("on") or key == "style" for key in attributes), (name, tag, attributes)
+            assert not any(key.startswith("on") or key == "style" for key in attributes), (
+                name,
+                tag,
+                attributes,
+            )
             for key in ("href", "src"):
                 address = attributes.get(key, "#main")
                 if address.startswith("#"):
                     assert address[1:] in ids, (name, address)
                 elif not address.startswith("data:"):
-                    target = str(Path("/", name).parent.joinpath(address).resolve().relative_to("/"))
+                    target = str(
+                        Path("/", name).parent.joinpath(address).resolve().relative_to("/")
+                    )
                     assert target in written, (name, address)
         policy = next(a["content"] for t, a in parsed.elements if t == "meta" and "http-equiv" in a)
         assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
@@ -156,10 +176,14 @@ def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
 
     written, expected = pages_with(name), pages_with("p" * len(name))
     for file in written:
-        assert re.fullmatch(r"index\.html|data\.json|data\.csv|submissions/[a-z0-9-]+-[0-9a-f]{12}\.html", file)
+        assert re.fullmatch(
+            r"index\.html|data\.json|data\.csv|submissions/[a-z0-9-]+-[0-9a-f]{12}\.html", file
+        )
     index, plain = Parsed(written["index.html"].decode()), Parsed(expected["index.html"].decode())
     assert [tag for tag, _ in index.elements] == [tag for tag, _ in plain.elements]
-    assert [tuple(attributes) for _, attributes in index.elements] == [tuple(a) for _, a in plain.elements]
+    assert [tuple(attributes) for _, attributes in index.elements] == [
+        tuple(a) for _, a in plain.elements
+    ]
     assert name in index.text
     for file, content in written.items():
         if file.startswith("submissions/"):
@@ -176,20 +200,26 @@ def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_pat
     change_json(bad, "submission.name", name)
     for output in (["--page", str(tmp_path / "page")], ["--markdown", str(tmp_path / "t.md")], []):
         error = refusal(fpp_bench, "leaderboard", bad, *output)
-        assert message in error and "bad.json" in error and len(error) < 2000 and "\x1b" not in error
+        assert (
+            message in error and "bad.json" in error and len(error) < 2000 and "\x1b" not in error
+        )
     assert not (tmp_path / "page").exists() and not (tmp_path / "t.md").exists()
 
 
 def test_escaping_holds_without_the_checks_before_it():
     assert escaped("\x1b[31m<b>\u202e") == "\\x1b[31m&lt;b&gt;\\u202e"
     assert len(escaped("<" * 10_000_000)) < 1000
-    assert "<title>&lt;/title&gt;</title>" in page("fpp_ml_bench", "parts.html", "</title>").decode()
+    assert (
+        "<title>&lt;/title&gt;</title>" in page("fpp_ml_bench", "parts.html", "</title>").decode()
+    )
 
 
 def test_a_slug_is_a_file_name_of_its_own(files):
     entry = read_entries(files[:1])[0]
     earlier = changed(entry, created="2020-01-01T00:00:00+00:00")
-    assert re.fullmatch(r"fast-and-rough-[0-9a-f]{12}", slug(entry)) and slug(entry) != slug(earlier)
+    assert re.fullmatch(r"fast-and-rough-[0-9a-f]{12}", slug(entry)) and slug(entry) != slug(
+        earlier
+    )
 
 
 points = st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12)
@@ -199,15 +229,22 @@ points = st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, m
 @settings(max_examples=300, deadline=None)
 def test_front_against_its_definition(places):
     def beaten(place):
-        return any(better[0] <= place[0] and better[1] <= place[1] and better != place for better in places)
+        return any(
+            better[0] <= place[0] and better[1] <= place[1] and better != place for better in places
+        )
 
-    assert sorted(pareto_front(places)) == [index for index, place in enumerate(places) if not beaten(place)]
-    assert [places[i] for i in pareto_front(places)] == sorted(places[i] for i in pareto_front(places))
+    assert sorted(pareto_front(places)) == [
+        index for index, place in enumerate(places) if not beaten(place)
+    ]
+    assert [places[i] for i in pareto_front(places)] == sorted(
+        places[i] for i in pareto_front(places)
+    )
 
 
 @st.composite
 def drawings(draw):
-    """Marks as far apart, as close together and as equal as they come, with and without intervals and names."""
+    """Marks as far apart, as close together and as equal as they come, with and without intervals
+    and names."""
     value = st.floats(1e-9, 1e9) | st.sampled_from([1.0, 1.01, 2.0])
     marks = []
     for number in range(1, draw(st.integers(1, 15)) + 1):
@@ -225,22 +262,40 @@ def test_every_mark_has_a_place_and_every_number_an_explanation(picture, size):
     parsed = Parsed(svg)
     assert [tag for tag, _ in parsed.elements].count("use") >= len(picture.marks)
     for tag, attributes in parsed.elements:
-        assert "style" not in attributes and (tag != "use" or -1 <= float(attributes["x"]) <= size[0])
-    labels = [(number, name) for name, number in re.findall(r'<g class="name">.*?>(x+|(\d+))</text>', svg)]
+        assert "style" not in attributes and (
+            tag != "use" or -1 <= float(attributes["x"]) <= size[0]
+        )
+    labels = [
+        (number, name) for name, number in re.findall(r'<g class="name">.*?>(x+|(\d+))</text>', svg)
+    ]
     assert [number for number, _ in labels if number] == [str(mark.number) for mark in numbered]
     shown_names = {name for number, name in labels if not number}
-    assert shown_names <= {mark.name for mark in picture.marks} and (picture.names or not shown_names)
+    assert shown_names <= {mark.name for mark in picture.marks} and (
+        picture.names or not shown_names
+    )
     assert picture.svg(*size, "wide scatter", "A picture")[0] == svg
 
 
 def test_hostile_names_are_text_in_a_picture():
-    """Also what matplotlib would take for mathematics, and what looks like an attribute that is rewritten."""
+    """Also what matplotlib would take for mathematics, and what looks like an attribute that is
+    rewritten."""
     names = [*HOSTILE, "$x^2$ and \\frac", 'x style="fill: #191c20" id="mark-1"']
-    marks = [Mark(10.0**n, 10.0**-n, n, name, "verified", title=name, row=name) for n, name in enumerate(names)]
+    marks = [
+        Mark(10.0**n, 10.0**-n, n, name, "verified", title=name, row=name)
+        for n, name in enumerate(names)
+    ]
     svg, _ = Scatter(marks, "a cost").svg(3000, 2000, "wide scatter", "A picture")
     parsed = Parsed(svg)
     assert all(parsed.text.count(name) >= 2 for name in names)  # label and tooltip
-    assert {tag for tag, _ in parsed.elements} == {"svg", "g", "path", "defs", "use", "text", "title"}
+    assert {tag for tag, _ in parsed.elements} == {
+        "svg",
+        "g",
+        "path",
+        "defs",
+        "use",
+        "text",
+        "title",
+    }
     assert not any(key.startswith("on") for _, attributes in parsed.elements for key in attributes)
 
 
@@ -254,12 +309,15 @@ def test_empty_board_says_how_to_begin(tmp_path, monkeypatch):
 
 def test_unwritable_page_is_an_error(files, tmp_path):
     (tmp_path / "file").write_text("")
-    assert "file: is a file; give a folder" in refusal(fpp_bench, "leaderboard", files[0], "--page", tmp_path / "file")
+    assert "file: is a file; give a folder" in refusal(
+        fpp_bench, "leaderboard", files[0], "--page", tmp_path / "file"
+    )
 
 
 @pytest.fixture
 def predicted(tmp_path, monkeypatch):
-    """A dataset with a camera of its size, predictions that say what they are of, and their result."""
+    """A dataset with a camera of its size, predictions that say what they are of, and their
+    result."""
     monkeypatch.setattr(scored_dataset, "paper_rig", lambda _: paper_rig(48))
     dataset = make_dataset(tmp_path / "data", (48, 48))
     source = {"dataset": str(dataset.path), "split": "test", "content": dict(dataset.content)}
@@ -277,10 +335,16 @@ def test_a_rows_page_shows_its_predictions(predicted, files, tmp_path):
     cloud = name.replace(".html", "-cloud.html")
     assert set(mine) == {name, cloud} and f'href="{cloud}"' in mine[name]
     assert "A method: " in mine[cloud] and "points in mm" in mine[cloud]
-    report = write_report(parse_result(read_json(result), result), dataset, folder, tmp_path / "report")
+    report = write_report(
+        parse_result(read_json(result), result), dataset, folder, tmp_path / "report"
+    )
     pictures = re.findall(r'<img [^>]*src="(data:image/png;base64,[^"]+)"', mine[name])
     assert len(set(pictures)) == 2 and all(picture in report.read_text() for picture in pictures)
-    assert "Median: " in mine[name] and "Worst: " in mine[name] and "Signed error: blue is too near" in mine[name]
+    assert (
+        "Median: " in mine[name]
+        and "Worst: " in mine[name]
+        and "Signed error: blue is too near" in mine[name]
+    )
     assert fpp_bench(*command) == 0  # without predictions, there are no pictures and no cloud
     (left,) = (out / "submissions").glob("a-method-*")
     assert "<img" not in left.read_text()
@@ -291,13 +355,18 @@ def test_predictions_that_no_result_is_of_are_refused(predicted, files, tmp_path
     page_of = ["--page", str(tmp_path / "page"), "--predictions", str(folder)]
     row = tmp_path / "row.json"
     assert fpp_bench("leaderboard", result, "--row", row) == 0
-    for given_file, why in ((files[0], "is not what was scored"), (row, "row files name no samples")):
+    for given_file, why in (
+        (files[0], "is not what was scored"),
+        (row, "row files name no samples"),
+    ):
         message = refusal(fpp_bench, "leaderboard", given_file, *page_of)
         assert why in message and f"{folder}: no given result was scored from it" in message
     for sample in dataset.samples("test"):
         np.save(folder / f"{sample}.npy", dataset.depth_mm(sample))
     assert "is not the file that was scored" in refusal(fpp_bench, "leaderboard", result, *page_of)
-    assert "give it with --page DIR" in refusal(fpp_bench, "leaderboard", result, "--predictions", folder)
+    assert "give it with --page DIR" in refusal(
+        fpp_bench, "leaderboard", result, "--predictions", folder
+    )
     assert not (tmp_path / "page").exists()
 
 
@@ -317,7 +386,10 @@ def test_predictions_without_a_depth_have_no_cloud(predicted, tmp_path):
 @settings(max_examples=100, deadline=None)
 def test_a_scale_holds_every_mean(means):
     rows = [
-        SimpleNamespace(rank_key="", value=lambda key, m=m: m, interval=lambda key, m=m: (0.0, 1.5 * m)) for m in means
+        SimpleNamespace(
+            rank_key="", value=lambda key, m=m: m, interval=lambda key, m=m: (0.0, 1.5 * m)
+        )
+        for m in means
     ]
     scale = LogScale.of(rows)
     assert all(scale.low < mean / 9 and 1.5 * mean < scale.high for mean in means)
@@ -332,14 +404,24 @@ def test_an_interval_that_reaches_zero_is_clipped_where_it_shows(files):
     reaching = changed(entry, intervals={RANK_KEY: [0.0, 9.0]})
     for shown, expected in ((entry, False), (reaching, True)):
         index = page_files(rank([shown]), [])["index.html"].decode()
-        assert ('<path class="beyond"' in index) is expected and ("an arrow marks those" in index) is expected
+        assert ('<path class="beyond"' in index) is expected and (
+            "an arrow marks those" in index
+        ) is expected
     assert "on one logarithmic scale" in index
 
 
 def test_a_picture_is_of_one_target(dataset, tmp_path, monkeypatch):
-    """Errors against exact and against decoded depth are in tables of their own; a picture holds one of them."""
+    """Errors against exact and against decoded depth are in tables of their own; a picture holds
+    one of them."""
     made = [
-        write_result_file(tmp_path / f"{target}.json", dataset, 2.0, name=target, target=target, timing=timing(3.0))
+        write_result_file(
+            tmp_path / f"{target}.json",
+            dataset,
+            2.0,
+            name=target,
+            target=target,
+            timing=timing(3.0),
+        )
         for target in ("depth", "depth_exact")
     ]
     entries = read_entries(made)

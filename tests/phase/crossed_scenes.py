@@ -34,8 +34,8 @@ def frame(
     number: int = 0,
     gamma: float = 1.0,
 ) -> NDArray[np.uint8]:
-    """Crossed frame ``number`` uint8 (H, W) of a surface at ``depth_mm`` (H, W), 0 where the background is; ``gamma``:
-    of the projector."""
+    """Crossed frame ``number`` uint8 (H, W) of a surface at ``depth_mm`` (H, W), 0 where the
+    background is; ``gamma``: of the projector."""
     x, y = rig.camera.rays()
     z = np.where(depth_mm > 0, depth_mm / 1000, rig.background_m or 3.2)
     u, v = rig.project(np.stack([x * z, y * z, z], axis=-1))
@@ -52,7 +52,8 @@ def frame(
 
 
 def slab(rig: Rig = RIG, middle_mm: float = 1800.0, slope: float = 0.4) -> NDArray[np.float64]:
-    """Depth in mm (H, W) of a square slab before the background, tilted by ``slope`` mm a px; 0 around it."""
+    """Depth in mm (H, W) of a square slab before the background, tilted by ``slope`` mm a px; 0
+    around it."""
     height, width = rig.camera.height, rig.camera.width
     y, x = np.mgrid[:height, :width]
     inside = (np.abs(x - width / 2) < width * 0.28) & (np.abs(y - height / 2) < height * 0.28)

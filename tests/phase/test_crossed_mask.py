@@ -1,4 +1,5 @@
-"""The mask of one crossed frame where the wall or the object is hard to see, and edges between surfaces."""
+"""The mask of one crossed frame where the wall or the object is hard to see, and edges between
+surfaces."""
 
 from dataclasses import replace
 
@@ -47,16 +48,21 @@ def test_a_plain_slab() -> None:
 
 @pytest.mark.parametrize("wall_grey", [4.0, 40.0, 90.0])
 def test_a_wall_without_visible_fringes(wall_grey: float) -> None:
-    """Blurred out, or no wall: half of the slab has less modulation than would count as a fringe by itself."""
+    """Blurred out, or no wall: half of the slab has less modulation than would count as a fringe by
+    itself."""
     image = shown(white_grey=np.where(X < 160, 14.0, 150.0))
     plain = wall_grey + np.random.default_rng(3).normal(0, 0.7, image.shape)
-    missed, invented = shares(np.where(INSIDE, image, np.clip(np.rint(plain), 0, 255)).astype(np.uint8))
+    missed, invented = shares(
+        np.where(INSIDE, image, np.clip(np.rint(plain), 0, 255)).astype(np.uint8)
+    )
     assert missed < 0.02 and invented < 0.01
 
 
 def test_texture_over_wall_and_object(monkeypatch: pytest.MonkeyPatch) -> None:
     painted = np.rint(6 + CHECKS * (shown(noise_grey=0.0).astype(float) - 6))
-    image = np.clip(np.rint(painted + np.random.default_rng(5).normal(0, 0.7, painted.shape)), 0, 255).astype(np.uint8)
+    image = np.clip(
+        np.rint(painted + np.random.default_rng(5).normal(0, 0.7, painted.shape)), 0, 255
+    ).astype(np.uint8)
     missed, invented = shares(image)
     assert missed < 0.01 and invented < 0.06
     monkeypatch.setattr(empty_scene, "TEXTURED", np.inf)
@@ -87,7 +93,9 @@ def test_a_shadow_that_other_light_reaches_is_no_object(monkeypatch: pytest.Monk
     def answered() -> float:
         return float((route(CUT, FAMILY).measure(image).depth_mm > 0)[shadow].mean())
 
-    assert answered() < 0.5 and shares(image)[0] < 2e-3  # a window beside the wall sees the wall's fringes
+    assert (
+        answered() < 0.5 and shares(image)[0] < 2e-3
+    )  # a window beside the wall sees the wall's fringes
     monkeypatch.setattr(observe, "FAINT_SIGMAS", 0.0)
     assert answered() > 0.95
 
@@ -120,14 +128,20 @@ def test_the_wall_is_seen_through_narrow_gaps(monkeypatch: pytest.MonkeyPatch) -
 def test_a_network_in_doubt_does_not_fill_what_shows_the_wall() -> None:
     bars = INSIDE & (X % 24 >= 10)
     measured = route(CUT, FAMILY)
-    part = CrossedNetPart(measured.model.carriers, CrossedRecipe(widths=(4, 4)).network(), threshold=-1.5, lead=0.0)
-    fitted = measured.choose(measured.observe(frame(np.where(bars, DEPTH_MM, 0.0), CUT, FAMILY), None))
+    part = CrossedNetPart(
+        measured.model.carriers, CrossedRecipe(widths=(4, 4)).network(), threshold=-1.5, lead=0.0
+    )
+    fitted = measured.choose(
+        measured.observe(frame(np.where(bars, DEPTH_MM, 0.0), CUT, FAMILY), None)
+    )
     scene = CrossedScene.of(fitted)
     shape = scene.light.shape
     logits = np.where(scene.exists, np.array([0, 9, 0])[:, None, None], -np.inf)
 
     def answered(object_logit: float) -> tuple[float, float]:
-        answers = Answers(logits, np.full(shape, object_logit), np.zeros(shape), np.full(shape, 0.1))
+        answers = Answers(
+            logits, np.full(shape, object_logit), np.zeros(shape), np.full(shape, 0.1)
+        )
         found = measured.depth(part.answered(fitted, scene, answers)).depth_mm > 0
         return float(found[INSIDE & ~bars].mean()), float((~found[bars]).mean())
 
@@ -143,11 +157,15 @@ def test_a_pixel_that_the_wall_explains_too_is_answered_and_said_to_be_in_doubt(
     assert 50 < doubted.sum() < 0.02 * INSIDE.sum() and (found.reason == Reason.WALL)[doubted].any()
     assert (found.depth_mm[doubted] > 0).all() and doubted[bars].mean() < 0.002
     strict = two_carriers(TwoCarriers(CUT, Settings(min_confidence=0.02), FAMILY)).measure(image)
-    assert not (strict.depth_mm[doubted] > 0).any() and (strict.depth_mm > 0).sum() > 0.9 * (found.depth_mm > 0).sum()
+    assert (
+        not (strict.depth_mm[doubted] > 0).any()
+        and (strict.depth_mm > 0).sum() > 0.9 * (found.depth_mm > 0).sum()
+    )
 
 
 def test_a_step_between_two_surfaces_is_sharp(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the neighbours' offers switched off, the control, the error beside the step is larger."""
+    """With the neighbours' offers switched off, the control, the error beside the step is
+    larger."""
     step_mm = np.where(INSIDE, np.where(X < 160, 1760.0, 1800.0), 0.0)
     image = frame(step_mm, CUT, FAMILY)
     beside = INSIDE & (np.abs(X - 159.5) < 6) & (np.abs(Y - 160) < 70)
@@ -161,10 +179,13 @@ def test_a_step_between_two_surfaces_is_sharp(monkeypatch: pytest.MonkeyPatch) -
 
 
 def moved_rig(projector_px: float) -> Rig:
-    """What photographs where `CUT` is its calibration: its projector's image is shifted and a little turned."""
+    """What photographs where `CUT` is its calibration: its projector's image is shifted and a
+    little turned."""
     turn = 0.3 * projector_px / CUT.projector.fx
     first, second, third = np.array([[1, -turn, 0], [turn, 1, 0], [0, 0, 1]]) @ CUT.R
-    projector = replace(CUT.projector, cx=CUT.projector.cx + projector_px, cy=CUT.projector.cy - projector_px / 2)
+    projector = replace(
+        CUT.projector, cx=CUT.projector.cx + projector_px, cy=CUT.projector.cy - projector_px / 2
+    )
     return replace(CUT, projector=projector, rotation=(tuple(first), tuple(second), tuple(third)))
 
 
@@ -188,15 +209,21 @@ def test_a_surface_far_from_the_walls_phases_is_no_wall() -> None:
 
 
 def like_the_wall(true: Rig) -> NDArray[np.float64]:
-    """A slab that shows ``true`` all but the phases that `CUT` expects of its wall: its depth in mm (H, W)."""
+    """A slab that shows ``true`` all but the phases that `CUT` expects of its wall: its depth in mm
+    (H, W)."""
     expected, carriers = route(CUT, FAMILY).model.carriers, Carriers.of(true, FAMILY)
     wall = expected.phases(expected.nearness(3200.0))
     depths_mm = np.arange(1500.0, 2100.0, 1.0)
-    off_rad = [np.hypot(*wrapped(carriers.phases(carriers.nearness(depth)) - wall)).mean() for depth in depths_mm]
+    off_rad = [
+        np.hypot(*wrapped(carriers.phases(carriers.nearness(depth)) - wall)).mean()
+        for depth in depths_mm
+    ]
     return np.where(INSIDE, depths_mm[np.argmin(off_rad)], 0.0)
 
 
-@pytest.mark.parametrize("true", [CUT, BESIDE["calibration 1.0 px"]], ids=["no wall", "calibration 1 px"])
+@pytest.mark.parametrize(
+    "true", [CUT, BESIDE["calibration 1.0 px"]], ids=["no wall", "calibration 1 px"]
+)
 def test_a_flat_object_is_not_taken_for_the_wall(true: Rig) -> None:
     image = frame(like_the_wall(true), true, FAMILY)
     if true is CUT:
@@ -206,7 +233,9 @@ def test_a_flat_object_is_not_taken_for_the_wall(true: Rig) -> None:
     assert missed < 0.1 and invented < 5e-3
 
 
-def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     # A corner of the whole image, where the wall's light falls off most.
     corner = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320))
     light = empty_scene.plane_irradiance(corner, corner.background_m)
@@ -222,11 +251,15 @@ def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(monkeypatch: p
 
 
 @pytest.mark.parametrize("frames", [1, 3])
-def test_what_is_in_the_images_border_alone_is_no_object(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_in_the_images_border_alone_is_no_object(
+    frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A blurred image: beyond its border the blur has nothing to mix."""
     method = two_carriers(TwoCarriers(CUT, family=FAMILY, moved=0 if frames == 3 else None))
     images = [frame(DEPTH_MM, CUT, FAMILY, number=number) for number in range(frames)]
-    images = [cv2.GaussianBlur(image, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE) for image in images]
+    images = [
+        cv2.GaussianBlur(image, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE) for image in images
+    ]
     border = np.ones(DEPTH_MM.shape, bool)
     border[9:-9, 9:-9] = False
 

@@ -1,4 +1,5 @@
-"""The crossed route on surfaces of known depth: any exposure, albedo and rig, and where it must say no."""
+"""The crossed route on surfaces of known depth: any exposure, albedo and rig, and where it must say
+no."""
 
 from dataclasses import replace
 
@@ -10,7 +11,12 @@ from skimage.filters import gabor_kernel
 
 from fpp_ml_bench.baselines.phase.depth import Reason, reaching
 from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
-from fpp_ml_bench.baselines.phase.local_fit import CURVED, DEMODULATION_PERIODS, Demodulator, window_kernels
+from fpp_ml_bench.baselines.phase.local_fit import (
+    CURVED,
+    DEMODULATION_PERIODS,
+    Demodulator,
+    window_kernels,
+)
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -20,13 +26,21 @@ from fpp_ml_bench.optics.rig import Rig
 ANGLE = np.deg2rad(5.0)
 TURNED_RIG = replace(
     NO_PLANE,
-    rotation=((np.cos(ANGLE), 0.0, np.sin(ANGLE)), (0.0, 1.0, 0.0), (-np.sin(ANGLE), 0.0, np.cos(ANGLE))),
+    rotation=(
+        (np.cos(ANGLE), 0.0, np.sin(ANGLE)),
+        (0.0, 1.0, 0.0),
+        (-np.sin(ANGLE), 0.0, np.cos(ANGLE)),
+    ),
     translation_m=(-0.05, -0.14, 0.03),
 )
-BENT_RIG = replace(NO_PLANE, projector=replace(NO_PLANE.projector, distortion=(-0.08, 0.05, 0.001, -0.001, 0.0)))
+BENT_RIG = replace(
+    NO_PLANE, projector=replace(NO_PLANE.projector, distortion=(-0.08, 0.05, 0.001, -0.001, 0.0))
+)
 
 
-def errors(rig: Rig, family: Crossed, image: NDArray[np.uint8], depth_mm: NDArray) -> tuple[NDArray, NDArray]:
+def errors(
+    rig: Rig, family: Crossed, image: NDArray[np.uint8], depth_mm: NDArray
+) -> tuple[NDArray, NDArray]:
     """Errors in mm where a depth was found on the object, and whether each object pixel has one."""
     found = route(rig, family).measure(image).depth_mm
     inside = depth_mm > 0
@@ -34,7 +48,9 @@ def errors(rig: Rig, family: Crossed, image: NDArray[np.uint8], depth_mm: NDArra
     return np.abs(found[inside] - depth_mm[inside])[answered], answered
 
 
-@pytest.mark.parametrize("rig", [RIG, NO_PLANE, TURNED_RIG, BENT_RIG], ids=["paper", "no plane", "turned", "lens"])
+@pytest.mark.parametrize(
+    "rig", [RIG, NO_PLANE, TURNED_RIG, BENT_RIG], ids=["paper", "no plane", "turned", "lens"]
+)
 def test_nearness_and_depth_are_inverse_and_the_phases_those_of_the_rig(rig: Rig) -> None:
     carriers = Carriers.of(rig, FAMILY)
     x, y = rig.camera.rays()
@@ -43,8 +59,11 @@ def test_nearness_and_depth_are_inverse_and_the_phases_those_of_the_rig(rig: Rig
         u, v = rig.project(np.stack([x * z, y * z, z], axis=-1))
         exact = np.stack([2 * np.pi * (a * u + b * v) for a, b in FAMILY.cycles_per_px])
         nearness = carriers.nearness(depth_mm)
-        # Single precision of phases in [-pi, pi] with a gain of 100 rad m; the lens bends by hundredths of a px.
-        assert np.abs(wrapped(carriers.phases(nearness) - exact)).max() < (2e-2 if rig is BENT_RIG else 2e-4)
+        # Single precision of phases in [-pi, pi] with a gain of 100 rad m; the lens bends by
+        # hundredths of a px.
+        assert np.abs(wrapped(carriers.phases(nearness) - exact)).max() < (
+            2e-2 if rig is BENT_RIG else 2e-4
+        )
         # A pixel that shows the exact phases gets the exact depth, with a lens too.
         beside = wrapped(exact - carriers.phases(nearness))
         shown = nearness + (beside * carriers.gain).sum(axis=0) / carriers.joint_gain**2
@@ -52,7 +71,9 @@ def test_nearness_and_depth_are_inverse_and_the_phases_those_of_the_rig(rig: Rig
 
 
 @pytest.mark.parametrize("middle_mm", [1560.0, 1800.0, 2040.0])
-@pytest.mark.parametrize("rig", [RIG, NO_PLANE, TURNED_RIG, BENT_RIG], ids=["paper", "no plane", "turned", "lens"])
+@pytest.mark.parametrize(
+    "rig", [RIG, NO_PLANE, TURNED_RIG, BENT_RIG], ids=["paper", "no plane", "turned", "lens"]
+)
 def test_a_slab_at_any_distance(rig: Rig, middle_mm: float) -> None:
     depth_mm = slab(rig, middle_mm)
     image = frame(depth_mm, rig, background_grey=50.0 if rig.background_m else 0.0)
@@ -62,10 +83,14 @@ def test_a_slab_at_any_distance(rig: Rig, middle_mm: float) -> None:
     assert np.percentile(error, 95) < 12
 
 
-@pytest.mark.parametrize(("name", "options"), [("crossed", {}), ("crossed", {"frames": 3}), ("crossed-net", {})])
+@pytest.mark.parametrize(
+    ("name", "options"), [("crossed", {}), ("crossed", {"frames": 3}), ("crossed-net", {})]
+)
 def test_beyond_the_end_of_the_range_there_is_no_depth(name: str, options: dict[str, int]) -> None:
     depth_mm = slab(middle_mm=2100.0, slope=0.1)
-    frames = [frame(depth_mm, number=number) for number in range(3)] + [None] * (len(RIG.sequence) - 3)
+    frames = [frame(depth_mm, number=number) for number in range(3)] + [None] * (
+        len(RIG.sequence) - 3
+    )
     measured = load_method(name, RIG, **options).measure(frames)  # type: ignore[attr-defined]
     within, beyond = (depth_mm > 0) & (depth_mm < 2095), depth_mm > 2105
     assert measured.depth_mm.max() <= 2100
@@ -107,18 +132,28 @@ def test_demodulation_is_the_least_squares_solution_of_the_window() -> None:
     for across, down in carriers.step_rad:
         columns += [f(across * dx + down * dy).ravel() for f in (np.cos, np.sin)]
     for row, column in ((60, 60), (159, 162), (201, 120)):
-        part = image[row - half : row + half + 1, column - half : column + half + 1].ravel().astype(float)
-        answer = np.linalg.lstsq(root[:, None] * np.stack(columns, axis=1), root * part, rcond=None)[0]
+        part = (
+            image[row - half : row + half + 1, column - half : column + half + 1]
+            .ravel()
+            .astype(float)
+        )
+        answer = np.linalg.lstsq(
+            root[:, None] * np.stack(columns, axis=1), root * part, rcond=None
+        )[0]
         expected = answer[[6, 8]] - 1j * answer[[7, 9]]
-        assert np.abs(seen.amplitude[:, row, column] - expected).max() < 1e-3  # grey levels, single precision
+        assert (
+            np.abs(seen.amplitude[:, row, column] - expected).max() < 1e-3
+        )  # grey levels, single precision
         assert abs(seen.mean_grey[row, column] - answer[0]) < 1e-3
         # A grid point a third of a period apart leaves out the filter's weakest frequencies.
-        assert np.abs(coarse.amplitude[:, row // 3, column // 3] - expected).max() < 2e-3 * answer[0]
+        assert (
+            np.abs(coarse.amplitude[:, row // 3, column // 3] - expected).max() < 2e-3 * answer[0]
+        )
 
 
 def test_demodulation_agrees_with_gabor_filters_on_even_brightness() -> None:
-    # scikit-image's filter has neither the polynomial nor the other carrier in its model: on a plane of one brightness
-    # it sees the same phase, up to what its window lets through of both.
+    # scikit-image's filter has neither the polynomial nor the other carrier in its model: on a
+    # plane of one brightness it sees the same phase, up to what its window lets through of both.
     depth_mm = np.full((RIG.camera.height, RIG.camera.width), 1800.0)
     image = frame(depth_mm, noise_grey=0.0)
     carriers = Carriers.of(RIG, FAMILY)
@@ -127,11 +162,16 @@ def test_demodulation_agrees_with_gabor_filters_on_even_brightness() -> None:
     for number, (across, down) in enumerate(carriers.step_rad):
         sigma_px = 3 * carriers.period_px
         kernel = gabor_kernel(
-            np.hypot(across, down) / (2 * np.pi), theta=np.arctan2(down, across), sigma_x=sigma_px, sigma_y=sigma_px
+            np.hypot(across, down) / (2 * np.pi),
+            theta=np.arctan2(down, across),
+            sigma_x=sigma_px,
+            sigma_y=sigma_px,
         )
         half = np.array(kernel.shape) // 2
         for row in range(150, 171, 3):
-            part = image[row - half[0] : row + half[0] + 1, 160 - half[1] : 160 + half[1] + 1].astype(float)
+            part = image[
+                row - half[0] : row + half[0] + 1, 160 - half[1] : 160 + half[1] + 1
+            ].astype(float)
             part = part[: kernel.shape[0], : kernel.shape[1]]
             if part.shape != kernel.shape:
                 continue
@@ -145,7 +185,12 @@ def test_demodulation_agrees_with_gabor_filters_on_even_brightness() -> None:
 def test_a_frame_made_of_two_has_the_depth_of_one() -> None:
     rig = paper_rig(320)
     first, second = (
-        frame(slab(rig), rig, Crossed((18.0, 18.0), (angle, angle + 90), (1.0 - 1e-9, 1e-9)), noise_grey=0.3)
+        frame(
+            slab(rig),
+            rig,
+            Crossed((18.0, 18.0), (angle, angle + 90), (1.0 - 1e-9, 1e-9)),
+            noise_grey=0.3,
+        )
         for angle in (0.0, 90.0)
     )
     method = load_method("crossed", rig)
@@ -171,7 +216,8 @@ def test_one_direction_lost_is_said() -> None:
 
 
 def test_a_rival_exactly_on_the_truth_is_ambiguous() -> None:
-    # Gains of 1 : 1 / 2 over a range of more than two periods of the first: every second order fits exactly.
+    # Gains of 1 : 1 / 2 over a range of more than two periods of the first: every second order fits
+    # exactly.
     theta = np.degrees(np.arctan(0.5))
     rival = Crossed((14.0, 14.0), (128.66 + theta, 38.66 + theta))
     rig = replace(RIG, background_m=None)
@@ -208,9 +254,12 @@ def test_a_rival_widens_the_interval_as_far_as_it_is_likely() -> None:
     chance = np.array([0.0, 0.009, 0.011, 0.05, 0.9], np.float32)
     sigma = reaching(apart_rad, chance)
     assert np.array_equal(sigma[:2], [0.0, 0.0])
-    # 1.1% lies just within the 99% interval, 5% at the end of the 95% interval; beyond a third it is a standard error.
+    # 1.1% lies just within the 99% interval, 5% at the end of the 95% interval; beyond a third it
+    # is a standard error.
     assert sigma[2] == pytest.approx(2 / 2.54, rel=0.01)
-    assert sigma[3] == pytest.approx(2 / 1.96, rel=0.01) and sigma[4] == pytest.approx(2.0, rel=0.01)
+    assert sigma[3] == pytest.approx(2 / 1.96, rel=0.01) and sigma[4] == pytest.approx(
+        2.0, rel=0.01
+    )
 
 
 def test_what_is_refused() -> None:

@@ -39,13 +39,17 @@ def made(frames: int, direction: str = "horizontal", **options: object) -> Phase
 
 
 @cache
-def plane(distance_m: float, direction: str = "horizontal", noise: float = 1.0) -> list[np.ndarray | None]:
+def plane(
+    distance_m: float, direction: str = "horizontal", noise: float = 1.0
+) -> list[np.ndarray | None]:
     """All fringes and Gray frames of one direction on a plane that fills the frame."""
     x, y = RIG.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * distance_m
     light = PAPER.changed("camera", **camera_noise(noise))
     exposure = Exposure.of(RIG, light)
-    lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, light, exposure.pattern)
+    lit = light_surface(
+        points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, light, exposure.pattern
+    )
     indices = [*RIG.sequence.sinusoids(direction), *RIG.sequence.gray(direction)]  # type: ignore[arg-type]
     pixels = np.arange(x.size, dtype=np.uint32)
     images = exposure.expose(indices, lit, pixels, (7, "plane", 0))
@@ -58,7 +62,9 @@ def plane(distance_m: float, direction: str = "horizontal", noise: float = 1.0) 
 def scene(left_m: float, right_m: float) -> list[np.ndarray | None]:
     """A block before the calibrated plane, its left and right half at two distances."""
     frames: list[np.ndarray | None] = []
-    for back, left, right in zip(plane(RIG.background_m), plane(left_m), plane(right_m), strict=True):
+    for back, left, right in zip(
+        plane(RIG.background_m), plane(left_m), plane(right_m), strict=True
+    ):
         if back is None or left is None or right is None:
             frames.append(None)
             continue
@@ -70,7 +76,9 @@ def scene(left_m: float, right_m: float) -> list[np.ndarray | None]:
 
 def exact_mm(left_m: float, right_m: float) -> np.ndarray:
     depth = np.zeros((SIZE, SIZE))
-    depth[OBJECT] = np.broadcast_to(np.where(np.arange(SIZE) < HALF, left_m, right_m) * 1000, depth.shape)[OBJECT]
+    depth[OBJECT] = np.broadcast_to(
+        np.where(np.arange(SIZE) < HALF, left_m, right_m) * 1000, depth.shape
+    )[OBJECT]
     return depth
 
 
@@ -88,7 +96,12 @@ def test_steps_are_spread_and_complete_each_other() -> None:
         (0, 3, 6, 9, 12, 15),
     ]
     assert steps_of(18, 18) == tuple(range(18))
-    for steps, expected in ((18, (1, 2, 3, 6, 18)), (12, (1, 2, 3, 6, 12)), (9, (1, 2, 3, 6, 9)), (4, (1, 4))):
+    for steps, expected in (
+        (18, (1, 2, 3, 6, 18)),
+        (12, (1, 2, 3, 6, 12)),
+        (9, (1, 2, 3, 6, 9)),
+        (4, (1, 4)),
+    ):
         levels = levels_of(steps)
         assert levels == expected
         for few, more in pairwise(levels):
@@ -110,17 +123,26 @@ def test_two_frames_solve_the_tied_fringe() -> None:
         carrier = start
         for _ in range(3):
             fit = fringe_fit(
-                greys[:frames], np.ones(phase.shape, bool), carrier, 6.0, GaussianWindow(1.5), shifts[:frames]
+                greys[:frames],
+                np.ones(phase.shape, bool),
+                carrier,
+                6.0,
+                GaussianWindow(1.5),
+                shifts[:frames],
             )
             carrier = fit.phase_rad
         return fit
 
     fit = fitted(2)
     inner = (slice(6, -6), slice(6, -6))
-    assert np.abs(fit.phase_rad - phase)[inner].max() < 0.08  # where both are dark; a hundredth elsewhere
+    assert (
+        np.abs(fit.phase_rad - phase)[inner].max() < 0.08
+    )  # where both are dark; a hundredth elsewhere
     assert np.abs(fit.phase_rad - phase)[inner].mean() < 0.01
     assert np.abs(fit.brightness - bright)[inner].mean() < 0.2
-    assert np.abs(fitted(1).phase_rad - phase)[inner].mean() > 0.1  # a window this small needs the second frame
+    assert (
+        np.abs(fitted(1).phase_rad - phase)[inner].mean() > 0.1
+    )  # a window this small needs the second frame
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -129,13 +151,16 @@ def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> Non
     measurement = made(frames, direction, **USERS_WORD).measure(plane(1.8, direction))
     middle = (slice(150, 330), slice(150, 330))
     error = (measurement.depth_mm - 1800)[middle].astype(np.float64)
-    expected = depth_noise_mm(RIG, 1800.0, direction, frames, float(measurement.modulation_grey[middle].mean()), 1.0)
-    # Rounding adds a twelfth of a squared level to the noise; unequal steps weigh noise a little unevenly.
+    expected = depth_noise_mm(
+        RIG, 1800.0, direction, frames, float(measurement.modulation_grey[middle].mean()), 1.0
+    )
+    # Rounding adds a twelfth of a squared level to the noise; unequal steps weigh noise a little
+    # unevenly.
     assert 0.9 < error.std() / expected < 1.15
     assert abs(error.mean()) < 3 * expected / 180 + 0.05
-    assert (measurement.expected_error_mm - measurement.order_doubt_mm)[middle].mean() == pytest.approx(
-        np.abs(error).mean(), rel=0.25
-    )
+    assert (measurement.expected_error_mm - measurement.order_doubt_mm)[
+        middle
+    ].mean() == pytest.approx(np.abs(error).mean(), rel=0.25)
 
 
 @pytest.mark.parametrize("distance_m", [1.55, 1.8, 2.05])
@@ -174,7 +199,8 @@ def test_frames_are_added_until_the_stated_error_is_expected() -> None:
         (25, True),
     ]
     expected_mm = [look["expected_error_mm"] for look in looks]
-    # Two frames still average over a small window, which a plane rewards; from three on noise falls as the root.
+    # Two frames still average over a small window, which a plane rewards; from three on noise falls
+    # as the root.
     assert expected_mm[0] > 2 * expected_mm[1]
     assert expected_mm[2] == pytest.approx(expected_mm[4] * 6**0.5, rel=0.2)
     for place in (0, 1):
@@ -190,7 +216,9 @@ def test_frames_are_added_until_the_stated_error_is_expected() -> None:
 
 def test_doubt_about_the_order_asks_for_the_gray_code() -> None:
     frames, truth = scene(1.8, 1.8), exact_mm(1.8, 1.8)
-    chosen = FewestFrames(RIG, 2.0, shading=False).answer(frames)  # nothing but the range: two orders are as good
+    chosen = FewestFrames(RIG, 2.0, shading=False).answer(
+        frames
+    )  # nothing but the range: two orders are as good
     *before, last = looks_of(chosen)
     assert last["gray_code"] and last["frames"] == 3 + RIG.sequence.bits("horizontal")
     assert not any(look["gray_code"] for look in before)

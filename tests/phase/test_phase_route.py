@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flat_planes import DIRECT, FIRST, OTHER_RIG, PAPER, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
+from flat_planes import (
+    DIRECT,
+    FIRST,
+    OTHER_RIG,
+    PAPER,
+    RIG,
+    USERS_WORD,
+    photograph,
+    plane_depth_m,
+    plane_fringe,
+)
 
 from fpp_ml_bench.baselines.phase.depth import Reason
 from fpp_ml_bench.baselines.phase.empty_scene import image_noise_grey
@@ -29,7 +39,11 @@ SIZE = RIG.camera.width
 ANGLE = np.deg2rad(5.0)
 TURNED_RIG = replace(
     RIG,
-    rotation=((np.cos(ANGLE), 0.0, np.sin(ANGLE)), (0.0, 1.0, 0.0), (-np.sin(ANGLE), 0.0, np.cos(ANGLE))),
+    rotation=(
+        (np.cos(ANGLE), 0.0, np.sin(ANGLE)),
+        (0.0, 1.0, 0.0),
+        (-np.sin(ANGLE), 0.0, np.cos(ANGLE)),
+    ),
     translation_m=(-0.02, -0.14, 0.03),
 )
 
@@ -44,21 +58,32 @@ def route(direction: str, rig: Rig = RIG, **options: object) -> FringeRoute:
 @pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
 def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: str) -> None:
     tilt = (0.1, -0.06)
-    depth_m = plane_depth_m(rig, distance_m if distance_m == 1.8 else distance_m + (1.8 - distance_m) * 0.2, tilt)
+    depth_m = plane_depth_m(
+        rig, distance_m if distance_m == 1.8 else distance_m + (1.8 - distance_m) * 0.2, tilt
+    )
     for exact_m, slope in ((plane_depth_m(rig, distance_m), (0.0, 0.0)), (depth_m, tilt)):
-        measurement = route(direction, rig, **USERS_WORD).measure(plane_fringe(rig, FIRST[direction], exact_m, slope))
+        measurement = route(direction, rig, **USERS_WORD).measure(
+            plane_fringe(rig, FIRST[direction], exact_m, slope)
+        )
         lit = measurement.modulation_grey > 5
         assert lit.mean() > 0.7  # the projector's field ends before the camera's
         error = np.abs(measurement.depth_mm - exact_m * 1000)[lit]
         assert error.mean() < 1.0
-        given = measurement.depth_mm[lit] > 0  # at the end of the projector's field a depth may lie beyond the range
-        assert given.mean() > 0.9999 and (measurement.reason[lit][~given] == Reason.OUT_OF_RANGE).all()
+        given = (
+            measurement.depth_mm[lit] > 0
+        )  # at the end of the projector's field a depth may lie beyond the range
+        assert (
+            given.mean() > 0.9999 and (measurement.reason[lit][~given] == Reason.OUT_OF_RANGE).all()
+        )
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
-@pytest.mark.parametrize("rig", [RIG, replace(RIG, pitch_horizontal_px=90.0)], ids=["captured", "resampled"])
+@pytest.mark.parametrize(
+    "rig", [RIG, replace(RIG, pitch_horizontal_px=90.0)], ids=["captured", "resampled"]
+)
 def test_beyond_the_end_of_the_range_there_is_no_depth(rig: Rig, frames: int) -> None:
-    """A plane that leaves the range in the middle of the image, by 11 mm at most: exact up to the end, none beyond."""
+    """A plane that leaves the range in the middle of the image, by 11 mm at most: exact up to the
+    end, none beyond."""
     tilt = (0.025, 0.0)
     exact_m = plane_depth_m(rig, 2.1, tilt)
     method = PhaseMethod(rig, frames=frames, **USERS_WORD)
@@ -87,18 +112,24 @@ def test_a_projector_that_is_turned_and_ahead() -> None:
 
 
 def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
-    # One ray a pixel: a pixel with an area keeps 99.6% of the modulation, which moves the phase by 0.1 mm of its own.
+    # One ray a pixel: a pixel with an area keeps 99.6% of the modulation, which moves the phase by
+    # 0.1 mm of its own.
     exact_m = plane_depth_m(RIG, 1.8)
     middle = (slice(180, 300), slice(180, 300))
     spread = {}
     for noise in (1.0, 3.0):
-        measurement = route("vertical", **USERS_WORD).measure(plane_fringe(RIG, 18, exact_m, noise=noise, light=DIRECT))
+        measurement = route("vertical", **USERS_WORD).measure(
+            plane_fringe(RIG, 18, exact_m, noise=noise, light=DIRECT)
+        )
         error = (measurement.depth_mm - exact_m * 1000)[middle]
         spread[noise] = error.std()
         sigma_px = SECOND_WINDOW_PERIODS * RIG.image_px_per_period("vertical")
         averaged = int(4 * np.pi * sigma_px**2)
-        predicted = depth_noise_mm(RIG, 1800.0, "vertical", averaged, measurement.modulation_grey[middle].mean(), noise)
-        # Where the fringe is at its extremes a narrow window sees less of the phase: up to twice the even spread.
+        predicted = depth_noise_mm(
+            RIG, 1800.0, "vertical", averaged, measurement.modulation_grey[middle].mean(), noise
+        )
+        # Where the fringe is at its extremes a narrow window sees less of the phase: up to twice
+        # the even spread.
         assert 0.6 * predicted < spread[noise] < 2.5 * predicted
     assert 2.2 < spread[3.0] / spread[1.0] < 4
 
@@ -139,9 +170,13 @@ def test_depth_lies_on_the_candidates_whoever_chooses() -> None:
     order = first + np.random.default_rng(0).integers(0, count).astype(np.int32)
     measurement = random_route.depth(FringeOrder(seen, order, np.zeros(order.shape, np.float32)))
     on_object = measurement.depth_mm > 0
-    assert on_object.sum() > 3000 and np.array_equal(measurement.order[seen.crop][seen.inside], order[seen.inside])
+    assert on_object.sum() > 3000 and np.array_equal(
+        measurement.order[seen.crop][seen.inside], order[seen.inside]
+    )
     layer = random_route.model.layer.at(on_object)
-    again = layer.depth_mm(measurement.wrapped_phase_rad[on_object].astype(np.float64), measurement.order[on_object])
+    again = layer.depth_mm(
+        measurement.wrapped_phase_rad[on_object].astype(np.float64), measurement.order[on_object]
+    )
     assert np.abs(again - measurement.depth_mm[on_object]).max() < 1e-2
     with pytest.raises(DecodeError, match="an order and a margin"):
         FringeOrder(seen, order[1:], np.zeros(order.shape, np.float32))
@@ -159,9 +194,12 @@ def test_nothing_is_measured_where_nothing_is() -> None:
 def test_saturated_ambiguous_and_thin_are_said() -> None:
     exact_m = plane_depth_m(RIG, 1.8)
     image = plane_fringe(RIG, 0, exact_m)
-    bright = np.clip(image * 2.5, 0, 255).astype(np.uint8)  # white at the near end of the range: grey level 450
+    bright = np.clip(image * 2.5, 0, 255).astype(
+        np.uint8
+    )  # white at the near end of the range: grey level 450
     assert route("horizontal").measure(bright).counts["saturated"] > 0.2 * image.size
-    # Without brightness and without a prior a plane can't be told from one a period away: no margin, and it says so.
+    # Without brightness and without a prior a plane can't be told from one a period away: no
+    # margin, and it says so.
     blind = route("horizontal", shading=False, **USERS_WORD).measure(image)
     assert blind.counts["ambiguous"] > 0.5 * image.size
     assert blind.confidence.max() < 0.2
@@ -210,9 +248,10 @@ def test_the_users_word_gives_way_to_the_images_own_background() -> None:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("name", ["cork", "mug"])
 def test_exposure_does_not_matter(name: str, direction: str) -> None:
-    """The lamp's strength is read from the image, so pixels that are found have the same error. Noise stays as it is,
-    so dim pixels go missing: of the cork 23, 34 and 61 in 8,260. The benchmark's object MAE counts each with its whole
-    depth, so that one rises, from 7.6 to 16.6 mm."""
+    """The lamp's strength is read from the image, so pixels that are found have the same error.
+    Noise stays as it is, so dim pixels go missing: of the cork 23, 34 and 61 in 8,260. The
+    benchmark's object MAE counts each with its whole depth, so that one rises, from 7.6 to 16.6
+    mm."""
     errors, found = {}, {}
     for exposure in (1.0, 0.5, 0.25):
         row = photograph(name, "A60", light=PAPER.changed("camera", exposure=exposure))
@@ -237,7 +276,9 @@ def test_noise_of_an_image_is_found_in_it(sigma: float) -> None:
         assert image_noise_grey(row.frames[first]) == pytest.approx(sigma, rel=0.15)
 
 
-@pytest.mark.parametrize("span", [(1700.0, 1900.0), (1100.0, 2600.0)], ids=["one period or none", "ten periods"])
+@pytest.mark.parametrize(
+    "span", [(1700.0, 1900.0), (1100.0, 2600.0)], ids=["one period or none", "ten periods"]
+)
 def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
     pitch = 18.0 if span[0] > 1500 else 12.0
     sequence = replace(RIG.sequence, bits_vertical=8)
@@ -260,7 +301,9 @@ def test_method_is_registered_and_reports_itself() -> None:
     assert depth_mm.dtype == np.float32 and depth_mm.shape == (SIZE, SIZE)
 
 
-def test_the_users_word_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_users_word_from_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     dataset = str(tmp_path / "set")
     build(Path(dataset), BuildSettings(RIG, ("cork",), stored="single_shot"), workers=1)
     word = ["--white-grey", "180", "--ambient-grey", "0"]

@@ -12,12 +12,19 @@ from fpp_ml_bench.baselines.phase.labels import least_energy
 def problem(shape: tuple[int, int], count: int, seed: int) -> tuple[np.ndarray, ...]:
     random = np.random.default_rng(seed)
     unary = random.uniform(0, 1, (count, *shape)).astype(np.float32)
-    phase = (2 * np.pi * np.arange(count)[:, None, None] + random.normal(0, 0.7, shape)).astype(np.float32)
-    links = [random.uniform(0, 0.6, (shape[0], shape[1] - 1)), random.uniform(0, 0.6, (shape[0] - 1, shape[1]))]
+    phase = (2 * np.pi * np.arange(count)[:, None, None] + random.normal(0, 0.7, shape)).astype(
+        np.float32
+    )
+    links = [
+        random.uniform(0, 0.6, (shape[0], shape[1] - 1)),
+        random.uniform(0, 0.6, (shape[0] - 1, shape[1])),
+    ]
     return unary, phase, links[0].astype(np.float32), links[1].astype(np.float32)
 
 
-def energy(choice: np.ndarray, unary: np.ndarray, phase: np.ndarray, lx: np.ndarray, ly: np.ndarray) -> float:
+def energy(
+    choice: np.ndarray, unary: np.ndarray, phase: np.ndarray, lx: np.ndarray, ly: np.ndarray
+) -> float:
     pick = np.take_along_axis(phase, choice[None], 0)[0]
     total = np.take_along_axis(unary, choice[None], 0).sum()
     total += (np.minimum(np.abs(np.diff(pick, axis=1)), 1.5) * lx).sum()
@@ -55,7 +62,9 @@ def test_a_weak_majority_wins_a_strongly_coupled_field() -> None:
     right = random.uniform(size=(50, 50)) < 0.6
     unary = np.stack([right * 0.02, ~right * 0.02]).astype(np.float32)
     phase = np.broadcast_to(np.array([0, 6.28], np.float32)[:, None, None], unary.shape).copy()
-    choice, _ = least_energy(unary, phase, np.ones((50, 49), np.float32), np.ones((49, 50), np.float32), 2.5)
+    choice, _ = least_energy(
+        unary, phase, np.ones((50, 49), np.float32), np.ones((49, 50), np.float32), 2.5
+    )
     assert (choice == 1).all()
 
 
@@ -73,4 +82,6 @@ def test_the_compiled_code_gives_the_numbers_of_the_lines_it_was_made_from(
     results.append(least_energy(*arrays, limit_rad=1.5))
     assert np.array_equal(results[0][0], results[1][0])
     assert np.array_equal(results[0][1], results[1][1])
-    assert not np.array_equal(results[0][0], arrays[0].argmin(axis=0)) or count == 1  # smoothness had a say
+    assert (
+        not np.array_equal(results[0][0], arrays[0].argmin(axis=0)) or count == 1
+    )  # smoothness had a say

@@ -1,4 +1,5 @@
-"""The calibration layer against triangulation, against 50-digit arithmetic, and against itself in torch."""
+"""The calibration layer against triangulation, against 50-digit arithmetic, and against itself in
+torch."""
 
 from dataclasses import replace
 
@@ -19,10 +20,15 @@ SIZE = 96
 
 
 def toed_in() -> Rig:
-    """Another baseline, pitch and range; the projector turned by four degrees, ahead of the camera, distorted."""
+    """Another baseline, pitch and range; the projector turned by four degrees, ahead of the camera,
+    distorted."""
     base = paper_rig(SIZE)
     angle = np.deg2rad(4.0)
-    rotation = ((np.cos(angle), 0.0, np.sin(angle)), (0.0, 1.0, 0.0), (-np.sin(angle), 0.0, np.cos(angle)))
+    rotation = (
+        (np.cos(angle), 0.0, np.sin(angle)),
+        (0.0, 1.0, 0.0),
+        (-np.sin(angle), 0.0, np.cos(angle)),
+    )
     return replace(
         base,
         projector=replace(base.projector, distortion=(-0.12, 0.05, 0.001, -0.0007, 0.0)),
@@ -53,7 +59,9 @@ def depths(rig: Rig) -> np.ndarray:
 def test_layer_is_triangulation(rig: Rig, direction: str) -> None:
     layer, z = CalibrationLayer.of(rig, direction), depths(rig)
     x, y = rig.camera.rays()
-    coordinate = rig.project(np.stack([x, y, np.ones_like(x)], -1) * (z / 1000)[..., None])[direction == "horizontal"]
+    coordinate = rig.project(np.stack([x, y, np.ones_like(x)], -1) * (z / 1000)[..., None])[
+        direction == "horizontal"
+    ]
     absolute = TAU * coordinate / rig.pitch(direction)
     assert np.abs(layer.absolute_phase(z) - absolute).max() < 1e-9
     order = np.floor(absolute / TAU + 0.5)
@@ -69,7 +77,9 @@ def test_layer_to_50_digits() -> None:
     with mpmath.workdps(50):
         for row, column, z in ((0, 0, 1000.0), (40, 95, 1333.3), (95, 17, 1600.0)):
             ray = mpmath.matrix([float(x[row, column]), float(y[row, column]), 1.0])
-            point = mpmath.matrix(rig.R.tolist()) * ray * mpmath.mpf(z) / 1000 + mpmath.matrix(list(rig.translation_m))
+            point = mpmath.matrix(rig.R.tolist()) * ray * mpmath.mpf(z) / 1000 + mpmath.matrix(
+                list(rig.translation_m)
+            )
             u = rig.projector.fx * point[0] / point[2] + rig.projector.cx
             phase = 2 * mpmath.pi * u / rig.pitch_vertical_px
             order = int(mpmath.floor(phase / (2 * mpmath.pi)))
@@ -90,9 +100,14 @@ def test_torch_equals_numpy_and_has_gradients(rig: Rig) -> None:
     checked[::40, ::40] = True
 
     def depth_m(part: torch.Tensor) -> torch.Tensor:
-        return tensors.depth_mm(phase.masked_scatter(checked, part), torch.tensor(order))[checked] / 1000
+        return (
+            tensors.depth_mm(phase.masked_scatter(checked, part), torch.tensor(order))[checked]
+            / 1000
+        )
 
-    assert torch.autograd.gradcheck(depth_m, phase[checked].clone().requires_grad_(), eps=1e-6, atol=1e-6)
+    assert torch.autograd.gradcheck(
+        depth_m, phase[checked].clone().requires_grad_(), eps=1e-6, atol=1e-6
+    )
 
 
 def test_float32_keeps_a_hundredth_of_a_millimetre() -> None:
@@ -101,7 +116,9 @@ def test_float32_keeps_a_hundredth_of_a_millimetre() -> None:
     z = depths(rig)
     absolute = layer.absolute_phase(z)
     order = np.floor(absolute / TAU)
-    depth_mm = layer.tensors().depth_mm(torch.tensor(absolute - TAU * order).float(), torch.tensor(order).float())
+    depth_mm = layer.tensors().depth_mm(
+        torch.tensor(absolute - TAU * order).float(), torch.tensor(order).float()
+    )
     assert depth_mm.dtype == torch.float32
     assert np.abs(depth_mm.numpy() - z).max() < 2e-3
     # The same from the absolute phase in float32 loses most of that: why the residual form exists.
@@ -136,7 +153,9 @@ def test_candidates_are_the_orders_whose_depth_is_in_range(rig: Rig, direction: 
         z = layer.depth_mm(phase, middle + step)
         inside = (z >= near) & (z <= far)
         counted += inside
-        listed = (middle + step >= candidates.first) & (middle + step < candidates.first + candidates.count)
+        listed = (middle + step >= candidates.first) & (
+            middle + step < candidates.first + candidates.count
+        )
         assert np.array_equal(inside, listed)
     assert np.array_equal(counted, candidates.count)
     assert abs(candidates.count.mean() - rig.periods_in_range(direction)) < 0.25

@@ -1,4 +1,5 @@
-"""Three crossed frames: as exact as the noise, sharp at edges, and refused where the frames are others."""
+"""Three crossed frames: as exact as the noise, sharp at edges, and refused where the frames are
+others."""
 
 from dataclasses import replace
 from functools import cache
@@ -32,7 +33,9 @@ def route(rig: Rig = CUT) -> CrossedRoute:
     return two_carriers(TwoCarriers(rig, moved=0))
 
 
-def measured(depths_mm: list[NDArray], noise_grey: float = 0.7, rig: Rig = CUT, **light: float) -> Measurement:
+def measured(
+    depths_mm: list[NDArray], noise_grey: float = 0.7, rig: Rig = CUT, **light: float
+) -> Measurement:
     """Of three frames, each of a surface of its own."""
     images = [
         frame(depth_mm, rig, rig.crossed, noise_grey=noise_grey, number=number, **light)  # type: ignore[arg-type]
@@ -50,12 +53,18 @@ def test_a_slab_is_exact_to_the_noise_up_to_its_edge(middle_mm: float) -> None:
     assert (np.abs(error) > 5).mean() < 1e-4
     assert (found.depth_mm[~inside] > 0).mean() < 2e-3
     assert abs(np.median(error)) < 0.05
-    # One pixel's own phase has the noise sqrt(2 / 3) s / B: that of the mean of 25 pixels is five times less.
+    # One pixel's own phase has the noise sqrt(2 / 3) s / B: that of the mean of 25 pixels is five
+    # times less.
     carriers = route().model.carriers
     one_mm = carriers.mm_per_rad(depth_mm)[inside] * np.sqrt(2 / 3) * 0.76 / 40
     assert 0.15 < np.median(np.abs(error) / 0.6745) / np.median(one_mm) < 0.35
     assert 0.6 < (np.abs(error) < sigma).mean() < 0.85
-    rim = inside & ~(np.roll(inside, 1, 0) & np.roll(inside, -1, 0) & np.roll(inside, 1, 1) & np.roll(inside, -1, 1))
+    rim = inside & ~(
+        np.roll(inside, 1, 0)
+        & np.roll(inside, -1, 0)
+        & np.roll(inside, 1, 1)
+        & np.roll(inside, -1, 1)
+    )
     assert np.percentile(np.abs(found.depth_mm - depth_mm)[rim], 95) < 3 * np.median(one_mm)
 
 
@@ -73,7 +82,8 @@ def test_without_a_known_plane_and_on_paint() -> None:
 
 @pytest.mark.parametrize("indirect_grey", [0.0, 20.0])
 def test_a_bar_much_narrower_than_a_window_has_the_right_order(indirect_grey: float) -> None:
-    """A window on it shows the slab behind; its order is told by each pixel's own light, that of other surfaces off."""
+    """A window on it shows the slab behind; its order is told by each pixel's own light, that of
+    other surfaces off."""
     depth_mm, (y, x) = slab(CUT, 1900.0), np.indices((320, 320))
     bar = (depth_mm > 0) & (np.abs(x - 160 + 0.4 * (y - 160)) < 4)
     depth_mm = np.where(bar, 1650.0, depth_mm)
@@ -82,7 +92,9 @@ def test_a_bar_much_narrower_than_a_window_has_the_right_order(indirect_grey: fl
     assert (np.abs(found.depth_mm - depth_mm) > 20)[bar].mean() < 0.01
 
 
-def test_a_surface_whose_fringe_noise_hides_is_measured_by_averages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_surface_whose_fringe_noise_hides_is_measured_by_averages(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     depth_mm = slab(CUT)
     inside = depth_mm > 0
 
@@ -90,7 +102,11 @@ def test_a_surface_whose_fringe_noise_hides_is_measured_by_averages(monkeypatch:
         found = measured([depth_mm] * 3, noise_grey=2.0, white_grey=12.0).depth_mm
         answered = inside & (found > 0)
         wrong = np.abs(found - depth_mm)[answered] > 20
-        return (inside & ~answered).sum() / inside.sum(), float(wrong.mean()), float((found[~inside] > 0).mean())
+        return (
+            (inside & ~answered).sum() / inside.sum(),
+            float(wrong.mean()),
+            float((found[~inside] > 0).mean()),
+        )
 
     missed, wrong, invented = missed_wrong_invented()
     assert missed < 1e-3 and wrong < 1e-3 and invented < 1e-3
@@ -126,7 +142,9 @@ def test_the_mean_of_a_plane_leaves_an_edge_where_it_is() -> None:
     noisy = (true + random.normal(0, 0.02, true.shape)).astype(np.float32)
     psi, sigma = same_plane_mean(noisy, np.full_like(noisy, 0.02), np.ones(true.shape, bool))
     error = psi - true
-    assert np.abs(error[:, 29:31]).max() < 0.08  # no pixel beside the edge takes any of the other side
+    assert (
+        np.abs(error[:, 29:31]).max() < 0.08
+    )  # no pixel beside the edge takes any of the other side
     assert error[5:-5, 5:25].std() < 0.3 * 0.02
     assert 0.8 < error[5:-5, 5:25].std() / np.median(sigma[5:-5, 5:25]) < 1.3
     grey = phase_noise_grey(noisy, np.full_like(noisy, 30.0), np.ones(true.shape, bool))

@@ -1,4 +1,5 @@
-"""Images that show no known background: fringes of any contrast on surfaces of any brightness, and of any period."""
+"""Images that show no known background: fringes of any contrast on surfaces of any brightness, and
+of any period."""
 
 import copy
 from dataclasses import replace
@@ -27,16 +28,20 @@ from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 SMALL = paper_rig(240)
 NARROW = replace(SMALL, working_range_mm=(1600.0, 2000.0))
-LONG = replace(SMALL, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)  # 34 image px a period at 240 px
+LONG = replace(SMALL, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
+"""34 image px a period at 240 px."""
 
 
 def in_the_dark(
     rig: Rig, depth_m: NDArray[np.float64], contrast: float = 0.9, direction: str = "vertical"
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """A disk of the surface ``depth_m`` (H, W), whose brightness changes by a factor of two across it, in a dark room
-    where an unmodulated lamp lights a corner; and where the disk is. Phase by `Rig.project`."""
+    """A disk of the surface ``depth_m`` (H, W), whose brightness changes by a factor of two across
+    it, in a dark room where an unmodulated lamp lights a corner; and where the disk is. Phase by
+    `Rig.project`."""
     x, y = rig.camera.rays()
-    coordinate = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None])[direction == "horizontal"]
+    coordinate = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None])[
+        direction == "horizontal"
+    ]
     height, width = x.shape
     v, u = np.mgrid[:height, :width]
     disk = (u - width / 2) ** 2 + (v - height / 2) ** 2 < (0.35 * width) ** 2
@@ -56,7 +61,9 @@ def bowl(rig: Rig, nearest_m: float, farthest_m: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("contrast", [1.0, 0.8])
-def test_range_and_continuity_settle_the_order_of_a_surface_that_fills_the_range(contrast: float) -> None:
+def test_range_and_continuity_settle_the_order_of_a_surface_that_fills_the_range(
+    contrast: float,
+) -> None:
     depth_m = bowl(NARROW, 1.62, 1.97)
     image, disk = in_the_dark(NARROW, depth_m, contrast)
     measurement = one_carrier(OneCarrier(NARROW, Settings("vertical"))).measure(image)
@@ -64,7 +71,9 @@ def test_range_and_continuity_settle_the_order_of_a_surface_that_fills_the_range
     error = np.abs(measurement.depth_mm - depth_m * 1000)
     assert measurement.background_share == 0
     assert (answered & disk).sum() > 0.9 * disk.sum()
-    assert (answered & ~disk).sum() < 0.03 * disk.sum()  # neither the dark room nor the lamp's corner
+    assert (
+        answered & ~disk
+    ).sum() < 0.03 * disk.sum()  # neither the dark room nor the lamp's corner
     assert np.median(error[answered & disk]) < 3
     settled = answered & disk & (measurement.reason == Reason.MEASURED)
     assert settled.sum() > 0.6 * disk.sum()
@@ -77,7 +86,10 @@ def test_range_and_continuity_settle_the_order_of_a_surface_that_fills_the_range
 def test_where_two_orders_fit_the_range_there_is_no_depth(frames: int, direction: str) -> None:
     model = OneCarrier(SMALL, Settings(direction, frames=frames))  # type: ignore[arg-type]
     depth_m = plane_depth_m(SMALL, 1.8)
-    images = [plane_fringe(SMALL, (18 if direction == "vertical" else 0) + step, depth_m) for step in model.steps]
+    images = [
+        plane_fringe(SMALL, (18 if direction == "vertical" else 0) + step, depth_m)
+        for step in model.steps
+    ]
     measurement = one_carrier(model).measure(images)
     several = (measurement.candidates.count > 1) & (measurement.modulation_grey > 5)
     assert several.mean() > 0.5
@@ -89,21 +101,31 @@ def test_no_known_background_is_one_that_is_not_in_view() -> None:
     rig = copy.copy(NARROW)
     object.__setattr__(rig, "background_m", None)
     image, _ = in_the_dark(NARROW, bowl(NARROW, 1.62, 1.97))
-    unknown, unseen = (one_carrier(OneCarrier(some, Settings("vertical"))).measure(image) for some in (rig, NARROW))
+    unknown, unseen = (
+        one_carrier(OneCarrier(some, Settings("vertical"))).measure(image) for some in (rig, NARROW)
+    )
     np.testing.assert_array_equal(unknown.depth_mm, unseen.depth_mm)
     np.testing.assert_array_equal(unknown.reason, unseen.reason)
 
 
 def test_a_dim_texture_is_not_taken_for_the_background() -> None:
     x, y = SMALL.camera.rays()
-    grey = 3 + 1.5 * np.cos(2 * np.pi * 95 * (x + 0.4 * y)) + np.random.default_rng(0).normal(0, 0.6, x.shape)
-    measurement = one_carrier(OneCarrier(SMALL)).measure(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+    grey = (
+        3
+        + 1.5 * np.cos(2 * np.pi * 95 * (x + 0.4 * y))
+        + np.random.default_rng(0).normal(0, 0.6, x.shape)
+    )
+    measurement = one_carrier(OneCarrier(SMALL)).measure(
+        np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    )
     assert measurement.background_share == 0
     assert not measurement.depth_mm.any()
 
 
 def test_long_periods_are_measured_on_a_smaller_image() -> None:
-    row = photograph("cracker_box", "A60", replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0))
+    row = photograph(
+        "cracker_box", "A60", replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
+    )
     rig = replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
     assert rig.image_px_per_period("horizontal") > 60
     errors = []
@@ -116,7 +138,9 @@ def test_long_periods_are_measured_on_a_smaller_image() -> None:
         errors.append(np.median(np.abs(measurement.depth_mm - row.depth_mm)[target]))
         answered = measurement.depth_mm > 0
         layer = model.captured_layer.at(answered)
-        again = layer.depth_mm(measurement.wrapped_phase_rad[answered].astype(float), measurement.order[answered])
+        again = layer.depth_mm(
+            measurement.wrapped_phase_rad[answered].astype(float), measurement.order[answered]
+        )
         assert np.abs(again - measurement.depth_mm[answered]).max() < 0.05
         assert sum(measurement.counts.values()) == target.size
     assert errors[0] < 1.1 * errors[1] + 1
@@ -131,7 +155,10 @@ def test_what_comes_back_is_interpolated_but_not_across_a_jump() -> None:
     told = {"white_grey": 180.0, "ambient_grey": 6.0}
     model = OneCarrier(LONG, Settings("vertical", **told), periods=Periods(0, 8, 9))  # type: ignore[arg-type]
     assert model.resampling.needed and model.rig.camera.width < 60
-    assert model.resampling.captured_crop((slice(0, 10), slice(1, model.rig.camera.width)))[1].stop == 240
+    assert (
+        model.resampling.captured_crop((slice(0, 10), slice(1, model.rig.camera.width)))[1].stop
+        == 240
+    )
     measurement = one_carrier(model).measure(image)
     away = np.abs(np.arange(240) - 119.5) > 45
     error = np.abs(measurement.depth_mm - exact_mm)[:, away][60:180]
@@ -151,8 +178,16 @@ def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     for name, content, message in (
         ("absent.png", None, "found nothing there"),
         ("text.png", b"no image", "text.png: .*capture or copy it again"),
-        ("small.png", cv2.imencode(".png", np.ones((3, 4), np.uint8))[1].tobytes(), r"got \(3, 4\)"),
-        ("empty.png", cv2.imencode(".png", np.zeros((240, 240), np.uint8))[1].tobytes(), "shows no object"),
+        (
+            "small.png",
+            cv2.imencode(".png", np.ones((3, 4), np.uint8))[1].tobytes(),
+            r"got \(3, 4\)",
+        ),
+        (
+            "empty.png",
+            cv2.imencode(".png", np.zeros((240, 240), np.uint8))[1].tobytes(),
+            "shows no object",
+        ),
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
@@ -160,28 +195,59 @@ def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
             load_method("phase", NARROW, mask=tmp_path / name)
     dataset = str(tmp_path / "set")
     build(Path(dataset), BuildSettings(SMALL, ("cork",), stored="single_shot"), workers=1)
-    command = ["predict", "phase", dataset, "--split", "all", "--mask", str(file), "--out", str(tmp_path / "out")]
+    command = [
+        "predict",
+        "phase",
+        dataset,
+        "--split",
+        "all",
+        "--mask",
+        str(file),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(command) == 0
     capsys.readouterr()
-    assert main(["predict", "classical", dataset, "--mask", str(file), "--out", str(tmp_path / "wrong")]) == 2
+    assert (
+        main(
+            ["predict", "classical", dataset, "--mask", str(file), "--out", str(tmp_path / "wrong")]
+        )
+        == 2
+    )
     assert "--mask is an option of phase" in capsys.readouterr().err
 
 
 def test_shifts_of_any_code_are_those_that_the_route_expects() -> None:
-    """A code with its own origin and sign gives the depth that the paper's kind gives, from the same light."""
+    """A code with its own origin and sign gives the depth that the paper's kind gives, from the
+    same light."""
     data = paper_rig(200).to_dict()
     del data["pitch_px"]
     code = {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": -1, "origin_px": 4.5}
-    rig = rig_from_dict({**data, "sequence": {"vertical": code}, "working_range_mm": [1600, 1800], "standoff_m": 1.7})
-    assert np.allclose(rig.shifts_rad("vertical"), [-np.pi / 2, -np.pi / 2 - 2 * np.pi / 3, -np.pi / 2 - 4 * np.pi / 3])
+    rig = rig_from_dict(
+        {
+            **data,
+            "sequence": {"vertical": code},
+            "working_range_mm": [1600, 1800],
+            "standoff_m": 1.7,
+        }
+    )
+    assert np.allclose(
+        rig.shifts_rad("vertical"),
+        [-np.pi / 2, -np.pi / 2 - 2 * np.pi / 3, -np.pi / 2 - 4 * np.pi / 3],
+    )
     x, y = rig.camera.rays()
     u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * 1.7)
     frames = [
-        np.rint(np.nan_to_num(100 + 80 * np.cos(2 * np.pi * u_px / 18 + shift), nan=100)).astype(np.uint8)
+        np.rint(np.nan_to_num(100 + 80 * np.cos(2 * np.pi * u_px / 18 + shift), nan=100)).astype(
+            np.uint8
+        )
         for shift in rig.shifts_rad("vertical")
     ]
     profile = rig.code("vertical").profiles(912)[1].astype(float)
     lit = (u_px > 0) & (u_px < 911)
-    assert np.abs(np.interp(u_px, np.arange(912), profile) * 80 / 127.5 + 20 - frames[1])[lit].max() < 2
+    assert (
+        np.abs(np.interp(u_px, np.arange(912), profile) * 80 / 127.5 + 20 - frames[1])[lit].max()
+        < 2
+    )
     measurement = PhaseMethod(rig, direction="vertical", frames=3).measure(frames)
     assert np.median(np.abs(measurement.depth_mm[measurement.depth_mm > 0] - 1700)) < 2

@@ -1,4 +1,5 @@
-"""The rig of a published tree, found from its raw scans and depth alone, against the hidden rig that rendered it."""
+"""The rig of a published tree, found from its raw scans and depth alone, against the hidden rig
+that rendered it."""
 
 import shutil
 from dataclasses import replace
@@ -40,7 +41,9 @@ def tree(tmp_path_factory):
     return folder / "tree"
 
 
-def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(tree, tmp_path, capsys):
+def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(
+    tree, tmp_path, capsys
+):
     assert command("calibrate", "--from-depth", tree, "--out", tmp_path / "rig.yaml") == 0
     rig = load_rig(tmp_path / "rig.yaml")
     assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (30, 26)
@@ -63,7 +66,9 @@ def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(
 def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, capsys):
     assert command("import", tree, "--out", tmp_path / "assumed", "--workers", 1) == 0
     message = capsys.readouterr().err
-    assert "warning: the paper's rig did not take" in message and "calibrate --from-depth" in message
+    assert (
+        "warning: the paper's rig did not take" in message and "calibrate --from-depth" in message
+    )
     assert command("import", tree, "--out", tmp_path / "fitted", "--workers", 1, "--fit-rig") == 0
     assert "warning" not in capsys.readouterr().err
     rig = DatasetFolder(tmp_path / "fitted").rig
@@ -81,7 +86,9 @@ def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, ca
     ],
     ids=["no tree", "no raw scans", "no folder", "suffix", "camera"],
 )
-def test_bad_input_is_a_message_status_2_and_no_file(tree, tmp_path, monkeypatch, capsys, options, message):
+def test_bad_input_is_a_message_status_2_and_no_file(
+    tree, tmp_path, monkeypatch, capsys, options, message
+):
     make_tree(tmp_path / "flat")
     (tmp_path / "tree").symlink_to(tree)
     save_rig(paper_rig(240), tmp_path / "wide.yaml")
@@ -133,7 +140,21 @@ def rays(maps):
 def test_import_names_another_reading_of_the_depth(words, change, tree, tmp_path, capsys):
     save_rig(HIDDEN, tmp_path / "rig.yaml")
     changed = rewritten(tree, tmp_path / "tree", change)
-    assert command("import", changed, "--out", tmp_path / "data", "--workers", 1, "--rig", tmp_path / "rig.yaml") == 0
+    assert (
+        command(
+            "import",
+            changed,
+            "--out",
+            tmp_path / "data",
+            "--workers",
+            1,
+            "--rig",
+            tmp_path / "rig.yaml",
+        )
+        == 0
+    )
     error = capsys.readouterr().err
-    assert (f"warning: another reading fits the tree's depth far better: {words}" in error) == bool(words), error
+    assert (f"warning: another reading fits the tree's depth far better: {words}" in error) == bool(
+        words
+    ), error
     assert words or "warning" not in error

@@ -1,4 +1,5 @@
-"""Importing a dataset of the published layout from a Hub on the loopback interface, through the real client."""
+"""Importing a dataset of the published layout from a Hub on the loopback interface, through the
+real client."""
 
 import hashlib
 import shutil
@@ -11,7 +12,16 @@ import pytest
 from hub_server import Repo
 from huggingface_hub import constants
 from huggingface_hub.utils import enable_progress_bars
-from published_trees import FOLDERS, TRAINING, depth_path, files_of, hub_of, imported, make_tree, write_mat
+from published_trees import (
+    FOLDERS,
+    TRAINING,
+    depth_path,
+    files_of,
+    hub_of,
+    imported,
+    make_tree,
+    write_mat,
+)
 from published_trees import PUBLISHED as NAME
 from publishing import ROOT
 
@@ -55,7 +65,9 @@ class Run:
     def downloaded(self):
         """Files that the last run asked for."""
         return {
-            path.split("/", 6)[-1] for method, path in self.server.requests if method == "GET" and "/resolve/" in path
+            path.split("/", 6)[-1]
+            for method, path in self.server.requests
+            if method == "GET" and "/resolve/" in path
         }
 
 
@@ -71,7 +83,9 @@ def assert_same_data(dataset, expected):
 
 
 def test_the_whole_run(run, tree, tmp_path, monkeypatch):
-    monkeypatch.setenv("TQDM_POSITION", "-1")  # the client's progress bars, also where there is no terminal,
+    monkeypatch.setenv(
+        "TQDM_POSITION", "-1"
+    )  # the client's progress bars, also where there is no terminal,
     enable_progress_bars()  # and after tests of publishing, which turns them off for its process
     commit = run.server.repos["datasets", NAME].commits[-1]
     status, printed, error = run(NAME, "--out", "data/published", "--workers", 1)
@@ -84,7 +98,10 @@ def test_the_whole_run(run, tree, tmp_path, monkeypatch):
     assert run.downloaded == {name for name in files_of(tree) if name.startswith(folders)}
     dataset = DatasetFolder("data/published")
     assert_same_data(dataset, imported(tree, tmp_path / "expected"))
-    assert dataset.manifest.settings["repository"] == NAME and dataset.manifest.settings["commit"] == commit
+    assert (
+        dataset.manifest.settings["repository"] == NAME
+        and dataset.manifest.settings["commit"] == commit
+    )
     assert f"{NAME} at commit {commit}" in printed and "Fetching 72 files: 100%" in error
     # Again: nothing is downloaded and nothing is written.
     status, printed, _ = run(NAME, "--out", "data/published", "--workers", 1)
@@ -117,24 +134,33 @@ def test_a_revision_is_a_tag_or_a_commit(run, tree, tmp_path):
     repo.tags["v1.0"] = commit, files_of(older)
     expected = imported(older, tmp_path / "expected")
     for revision in ("v1.0", commit):
-        status, printed, error = run(NAME, "--out", f"out-{revision}", "--revision", revision, "--workers", 1)
+        status, printed, error = run(
+            NAME, "--out", f"out-{revision}", "--revision", revision, "--workers", 1
+        )
         assert status == 0 and f"at commit {commit} ({revision})" in printed, error
         dataset = DatasetFolder(f"out-{revision}")
         assert_same_data(dataset, expected)
         assert dataset.manifest.settings["commit"] == commit
-    status, _, error = run(NAME, "--out", "out-v1.0", "--workers", 1)  # the main branch, into the same folder
+    status, _, error = run(
+        NAME, "--out", "out-v1.0", "--workers", 1
+    )  # the main branch, into the same folder
     assert status == 2 and "changed after it; give another folder or delete it" in error
 
 
 def test_raw_scans_come_where_they_are_asked_for(run, scanned, tmp_path):
     run.server.repos["datasets", NAME] = Repo(files=files_of(scanned))
-    frames = {name for name in files_of(scanned) if name.startswith("fpp_synthetic_dataset/") and "/A_" in name}
+    frames = {
+        name
+        for name in files_of(scanned)
+        if name.startswith("fpp_synthetic_dataset/") and "/A_" in name
+    }
     assert len(frames) == 6 * 52
     status, printed, error = run(NAME, "--out", "single", "--workers", 1)
     assert status == 0 and f"not needed: images of raw scans, {len(frames)} files" in printed, error
     assert not frames & run.downloaded
     assert DatasetFolder("single").configs == ("single_shot",)
-    # A part of them in the cache, of an import that was stopped, is no part of the tree for the import without them.
+    # A part of them in the cache, of an import that was stopped, is no part of the tree for the
+    # import without them.
     run.server.faults.add(max(frames))
     assert run(NAME, "--out", "all", "--workers", 1, "--raw-scans")[0] == 2
     assert run.downloaded & frames
@@ -149,7 +175,9 @@ def test_raw_scans_come_where_they_are_asked_for(run, scanned, tmp_path):
 def test_a_folder_of_that_name_is_read_instead(run, tree, tmp_path):
     shutil.copytree(tree, tmp_path / NAME)
     status, printed, error = run(NAME, "--out", "out", "--workers", 1)
-    assert status == 0 and f"{NAME}: reading this folder, not a dataset of that name" in printed, error
+    assert status == 0 and f"{NAME}: reading this folder, not a dataset of that name" in printed, (
+        error
+    )
     assert run.server.requests == []
     assert "repository" not in DatasetFolder("out").manifest.settings
 
@@ -158,12 +186,24 @@ REFUSALS = {
     "unknown": (["somebody/nothing"], "no such folder here, and no such dataset on http"),
     "private": (["somebody/private"], "no such dataset on http"),
     "gated": (["gated/data"], "accept the conditions"),
-    "no layout": (["somebody/else"], "does not have the published layout; expected training_datasets/ with one of"),
-    "parquet": (["somebody/parquet"], 'Parquet files, which datasets.load_dataset("somebody/parquet") opens'),
+    "no layout": (
+        ["somebody/else"],
+        "does not have the published layout; expected training_datasets/ with one of",
+    ),
+    "parquet": (
+        ["somebody/parquet"],
+        'Parquet files, which datasets.load_dataset("somebody/parquet") opens',
+    ),
     "no revision": ([NAME, "--revision", "v9\x1b"], r"has no branch, tag or commit 'v9\\x1b'"),
     "no raw scans": ([NAME, "--raw-scans"], "has no raw scans"),
-    "revision of a folder": (["tree", "--revision", "v1"], "--revision belongs to a dataset of the Hub"),
-    "raw scans of a folder": (["tree", "--raw-scans"], "--raw-scans belongs to a dataset of the Hub"),
+    "revision of a folder": (
+        ["tree", "--revision", "v1"],
+        "--revision belongs to a dataset of the Hub",
+    ),
+    "raw scans of a folder": (
+        ["tree", "--raw-scans"],
+        "--raw-scans belongs to a dataset of the Hub",
+    ),
     "not a name": (["a/b/c"], "or OWNER/NAME of a dataset on the Hugging Face Hub"),
 }
 
@@ -175,7 +215,9 @@ def test_refusals(run, tree, tmp_path, case):
     repos["datasets", "gated/data"] = Repo(files=files_of(tree))
     repos["datasets", "somebody/private"] = Repo(private=True, files=files_of(tree))
     repos["datasets", "somebody/else"] = Repo(files={"train.csv": b"a,b\n"})
-    repos["datasets", "somebody/parquet"] = Repo(files={"fpp-bench.json": b"{}", "data/test.parquet": b""})
+    repos["datasets", "somebody/parquet"] = Repo(
+        files={"fpp-bench.json": b"{}", "data/test.parquet": b""}
+    )
     (tmp_path / "tree").symlink_to(tree)
     refused(run, words, message)
     assert not (tmp_path / "out").exists()
@@ -184,7 +226,11 @@ def test_refusals(run, tree, tmp_path, case):
 def refused(run, words, message):
     status, _, error = run(*words, "--out", "out", "--workers", 1)
     *_, sentence = error.strip().splitlines()
-    assert status == 2 and sentence.startswith("fpp-bench import: error: ") and "Traceback" not in error
+    assert (
+        status == 2
+        and sentence.startswith("fpp-bench import: error: ")
+        and "Traceback" not in error
+    )
     assert message.replace("\\", "") in sentence.replace("\\", ""), sentence
 
 
@@ -196,14 +242,17 @@ def test_offline(run, monkeypatch):
 def test_a_disk_that_is_too_small(run, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr("shutil.disk_usage", lambda folder: usage(10**9, 10**9, 10**6))
-    refused(run, [NAME], "the disk has 0.00 GB free, and download and import need about 0.11 GB there")
+    refused(
+        run, [NAME], "the disk has 0.00 GB free, and download and import need about 0.11 GB there"
+    )
     assert run.downloaded == set()
 
 
 def test_opening_a_name_of_the_hub_says_how_to_fetch_it(run):
     name = "somebody/else"
     message = (
-        f"{name}: is no dataset folder; to fetch the published dataset: fpp-bench import {name} --out data/published"
+        f"{name}: is no dataset folder; to fetch the published dataset: fpp-bench import {name} "
+        f"--out data/published"
     )
     for opening in (fpp_ml_bench.load_dataset, fpp_ml_bench.open_dataset):
         with pytest.raises(DatasetError, match=message):
@@ -227,5 +276,7 @@ def test_help_does_not_wait_for_the_client():
         "import sys\nfrom fpp_ml_bench.cli import main\nassert main(['import', '--help']) == 0\n"
         "print({'huggingface_hub', 'datasets'} & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     assert done.stdout.splitlines()[-1] == "set()"

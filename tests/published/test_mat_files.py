@@ -1,4 +1,5 @@
-"""MATLAB files: compared with SciPy and with files written by MATLAB; damaged files must be refused."""
+"""MATLAB files: compared with SciPy and with files written by MATLAB; damaged files must be
+refused."""
 
 import io
 from pathlib import Path
@@ -13,7 +14,9 @@ from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.loaders.published.importing import read_matrix, read_scalar
 
 WRITTEN_BY_MATLAB = Path(scipy.io.matlab.__file__).parent / "tests" / "data"
-DEPTH = np.where(np.add.outer(np.arange(11), np.arange(7)) > 6, 1800 + np.arange(77.0).reshape(11, 7) / 3, 0)
+DEPTH = np.where(
+    np.add.outer(np.arange(11), np.arange(7)) > 6, 1800 + np.arange(77.0).reshape(11, 7) / 3, 0
+)
 
 
 def v5_bytes(compressed=True, **values):
@@ -37,10 +40,16 @@ def test_v73_comes_out_as_matlab_shows_it_not_transposed(tmp_path, dtype):
     file = tmp_path / "a.mat"
     file.write_bytes(v73_bytes(depthMap=DEPTH.astype(dtype)))
     read = read_matrix(file, "depthMap")
-    assert read.shape == (11, 7) and np.array_equal(read, DEPTH.astype(dtype)) and read.flags.c_contiguous
+    assert (
+        read.shape == (11, 7)
+        and np.array_equal(read, DEPTH.astype(dtype))
+        and read.flags.c_contiguous
+    )
 
 
-@pytest.mark.skipif(not WRITTEN_BY_MATLAB.is_dir(), reason="this SciPy was installed without its test data")
+@pytest.mark.skipif(
+    not WRITTEN_BY_MATLAB.is_dir(), reason="this SciPy was installed without its test data"
+)
 @pytest.mark.parametrize(
     ("name", "variable"),
     [
@@ -60,7 +69,9 @@ def test_files_written_by_matlab_read_as_scipy_reads_them(name, variable):
     assert np.array_equal(read, expected) and read.shape == expected.shape
 
 
-@pytest.mark.skipif(not WRITTEN_BY_MATLAB.is_dir(), reason="this SciPy was installed without its test data")
+@pytest.mark.skipif(
+    not WRITTEN_BY_MATLAB.is_dir(), reason="this SciPy was installed without its test data"
+)
 def test_a_v73_file_written_by_matlab():
     v5 = scipy.io.loadmat(WRITTEN_BY_MATLAB / "testdouble_7.4_GLNX86.mat")["testdouble"]
     assert np.allclose(read_matrix(WRITTEN_BY_MATLAB / "testhdf5_7.4_GLNX86.mat", "testdouble"), v5)
@@ -70,7 +81,9 @@ def test_scipy_reads_what_is_written_and_equal_values_give_equal_bytes(tmp_path)
     content = matrix_bytes({"depthMap": DEPTH.astype(np.float32), "depth_min": 1802.0})
     assert content == matrix_bytes({"depthMap": DEPTH.astype(np.float32), "depth_min": 1802.0})
     read = scipy.io.loadmat(io.BytesIO(content))
-    assert read["depthMap"].dtype == np.float32 and np.array_equal(read["depthMap"], DEPTH.astype(np.float32))
+    assert read["depthMap"].dtype == np.float32 and np.array_equal(
+        read["depthMap"], DEPTH.astype(np.float32)
+    )
     assert read["depth_min"].shape == (1, 1)
     (tmp_path / "a.mat").write_bytes(content)
     assert read_scalar(tmp_path / "a.mat", "depth_min") == 1802.0

@@ -1,4 +1,5 @@
-"""The frame order of a raw scan, determined from its images: all named orders, and exchanged files."""
+"""The frame order of a raw scan, determined from its images: all named orders, and exchanged
+files."""
 
 from itertools import combinations
 
@@ -6,7 +7,13 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.order import FrameOrder, all_orders, check_order, find_order, parse_order
+from fpp_ml_bench.loaders.published.order import (
+    FrameOrder,
+    all_orders,
+    check_order,
+    find_order,
+    parse_order,
+)
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE, Sequence
 
@@ -70,5 +77,8 @@ def test_a_repeated_file_is_noticed(scan):
 def test_images_without_any_pattern_fit_no_order():
     rng = np.random.default_rng(0)
     rig = paper_rig(64)
-    for grey in (lambda: rng.integers(0, 256, (64, 64), np.uint8), lambda: np.full((64, 64), 90, np.uint8)):
+    for grey in (
+        lambda: rng.integers(0, 256, (64, 64), np.uint8),
+        lambda: np.full((64, 64), 90, np.uint8),
+    ):
         assert find_order([grey() for _ in range(52)], rig) is None

@@ -55,16 +55,26 @@ def test_raw_depth_comes_in_bit_by_bit_with_the_published_split(tmp_path):
     assert_holds_the_tree(dataset)
     for sample in dataset.samples("all"):
         assert dataset.depth_mm(sample).tobytes() == depth_of(sample).tobytes()
-    assert dataset.configs == ("single_shot",) and not dataset.has_exact and dataset.manifest.origin == "imported"
+    assert (
+        dataset.configs == ("single_shot",)
+        and not dataset.has_exact
+        and dataset.manifest.origin == "imported"
+    )
     settings = dataset.manifest.settings
-    assert settings["depth_from"] == FOLDERS["raw"] and settings["rig_assumed"] and settings["frame_order"] is None
+    assert (
+        settings["depth_from"] == FOLDERS["raw"]
+        and settings["rig_assumed"]
+        and settings["frame_order"] is None
+    )
     assert dataset.rig == paper_rig(24)
 
 
 def test_the_global_variant_alone_is_metres(tmp_path):
     dataset = imported(make_tree(tmp_path / "tree", ("global",)), tmp_path / "out")
     assert_holds_the_tree(dataset)
-    for sample in dataset.samples("all"):  # two float32 roundings of 2**-24: to metres, and back to mm
+    for sample in dataset.samples(
+        "all"
+    ):  # two float32 roundings of 2**-24: to metres, and back to mm
         np.testing.assert_allclose(dataset.depth_mm(sample), depth_of(sample), rtol=2**-23, atol=0)
     assert dataset.manifest.settings["depth_from"] == FOLDERS["global"]
 
@@ -82,13 +92,18 @@ def test_the_individual_variant_alone_loses_only_the_pixels_at_least_depth(tmp_p
 def test_variants_beside_each_other_are_checked_against_raw(tmp_path):
     dataset = imported(make_tree(tmp_path / "tree", ALL_VARIANTS), tmp_path / "out")
     assert dataset.depth_mm("mug_A0").tobytes() == depth_of("mug_A0").tobytes()
-    assert dataset.manifest.settings["depth_checked_against"] == [FOLDERS["global"], FOLDERS["individual"]]
+    assert dataset.manifest.settings["depth_checked_against"] == [
+        FOLDERS["global"],
+        FOLDERS["individual"],
+    ]
 
 
 def test_v73_files_double_depth_and_rgb_copies_read_the_same(tmp_path):
     tree = make_tree(tmp_path / "tree")
     depth_path(tree).write_bytes(v73_bytes(depthMap=depth_of("power_drill_A60")))
-    write_mat(depth_path(tree, "val", "mug_A0"), False, depthMap=depth_of("mug_A0").astype(np.float64))
+    write_mat(
+        depth_path(tree, "val", "mug_A0"), False, depthMap=depth_of("mug_A0").astype(np.float64)
+    )
     write_png(fringe_path(tree), np.repeat(fringe_of("power_drill_A60")[..., None], 3, axis=2))
     dataset = imported(tree, tmp_path / "out")
     assert_holds_the_tree(dataset)
@@ -114,7 +129,10 @@ def test_dot_files_and_files_beside_the_folders_are_ignored(tmp_path):
 
 def test_an_own_rig_must_fit_the_images(tmp_path):
     tree = make_tree(tmp_path / "tree")
-    assert imported(tree, tmp_path / "out", rig=paper_rig(24)).manifest.settings["rig_assumed"] is False
+    assert (
+        imported(tree, tmp_path / "out", rig=paper_rig(24)).manifest.settings["rig_assumed"]
+        is False
+    )
     with pytest.raises(RigError, match=r"48 x 48 px.*24 x 24"):
         plan_import(tree, rig=paper_rig(48))
     with pytest.raises(RigError, match="--rig"):
@@ -187,10 +205,19 @@ BROKEN = {
     "a view is missing": (remove_view, f"object power_drill lacks {STEM}"),
     "fringe without depth": (lambda t: depth_path(t).unlink(), f"{MAT}: is missing"),
     "depth without fringe": (lambda t: fringe_path(t).unlink(), f"{PNG}: is missing"),
-    "extra file": (lambda t: (t / RAW / "test/fringe/notes.txt").write_text("x"), "notes.txt: does not belong"),
+    "extra file": (
+        lambda t: (t / RAW / "test/fringe/notes.txt").write_text("x"),
+        "notes.txt: does not belong",
+    ),
     "extra folder": (lambda t: (t / RAW / "holdout").mkdir(), "holdout: does not belong"),
-    "extra folder in a split": (lambda t: (t / RAW / "test/normals").mkdir(), "normals: does not belong"),
-    "no fringe folder": (lambda t: shutil.rmtree(t / RAW / "test/fringe"), "fringe: the folder is missing"),
+    "extra folder in a split": (
+        lambda t: (t / RAW / "test/normals").mkdir(),
+        "normals: does not belong",
+    ),
+    "no fringe folder": (
+        lambda t: shutil.rmtree(t / RAW / "test/fringe"),
+        "fringe: the folder is missing",
+    ),
     "a view that is none": (
         lambda t: move(fringe_path(t), fringe_path(t, stem="drill_A45")),
         "drill_A45.png: expected",
@@ -198,9 +225,18 @@ BROKEN = {
     "a link to nowhere": (lambda t: link_to_nowhere(fringe_path(t)), PNG),
     "png cut off": (lambda t: cut(fringe_path(t)), f"{PNG}: the PNG is cut off"),
     "png damaged": (lambda t: flip(fringe_path(t), 200), f"{PNG}: the PNG is damaged"),
-    "no png at all": (lambda t: fringe_path(t).write_bytes(b"P5 24 24 255 "), f"{PNG}: expected a PNG"),
-    "png of 16 bits": (lambda t: png(t, np.uint16(fringe_of(STEM))), f"{PNG}: expected an 8-bit PNG, got 16 bits"),
-    "png with alpha": (lambda t: png(t, np.zeros((24, 24, 4), np.uint8)), f"{PNG}: expected a grey PNG"),
+    "no png at all": (
+        lambda t: fringe_path(t).write_bytes(b"P5 24 24 255 "),
+        f"{PNG}: expected a PNG",
+    ),
+    "png of 16 bits": (
+        lambda t: png(t, np.uint16(fringe_of(STEM))),
+        f"{PNG}: expected an 8-bit PNG, got 16 bits",
+    ),
+    "png with alpha": (
+        lambda t: png(t, np.zeros((24, 24, 4), np.uint8)),
+        f"{PNG}: expected a grey PNG",
+    ),
     "png in colour": (rgb_with_a_colour, f"{PNG}: an RGB image whose channels differ"),
     "png of another size": (lambda t: png(t, fringe_of(STEM)[:20]), f"{PNG}: expected 24 x 24 px"),
     "mat cut off": (lambda t: cut(depth_path(t)), f"{MAT}: a data element"),
@@ -208,11 +244,17 @@ BROKEN = {
         lambda t: mat(t, depthMapMeters=depth_of(STEM)),
         f"{MAT}: expected the variable depthMap, got depthMapMeters",
     ),
-    "depth of another size": (lambda t: mat(t, depthMap=depth_of(STEM)[:, :20]), f"{MAT}: expected 24 x 24"),
+    "depth of another size": (
+        lambda t: mat(t, depthMap=depth_of(STEM)[:, :20]),
+        f"{MAT}: expected 24 x 24",
+    ),
     "depth NaN": (lambda t: set_pixel(depth_path(t), np.nan), f"{MAT}: 1 pixels are NaN"),
     "depth negative": (lambda t: set_pixel(depth_path(t), -1), f"{MAT}: 1 pixels are negative"),
     "depth empty": (lambda t: mat(t, depthMap=np.zeros((24, 24))), f"{MAT}: no pixel is above 0"),
-    "depth in cm": (lambda t: mat(t, depthMap=depth_of(STEM) / 10), "the file has another unit (times 10 it fits)"),
+    "depth in cm": (
+        lambda t: mat(t, depthMap=depth_of(STEM) / 10),
+        "the file has another unit (times 10 it fits)",
+    ),
     "depth with a mark": (
         lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), 65535)),
         f"{MAT}: 79% of the pixels are exactly 65535, far from all depths: a value for background?",
@@ -251,7 +293,8 @@ BROKEN_VARIANTS = {
     "variants disagree": (
         ("raw", "global"),
         lambda t: write_mat(
-            depth_path(t, variant="global"), depthMapMeters=(depth_of(STEM) + (depth_of(STEM) > 0) * 0.05) / 1000
+            depth_path(t, variant="global"),
+            depthMapMeters=(depth_of(STEM) + (depth_of(STEM) > 0) * 0.05) / 1000,
         ),
         f"global_normalized/test/depth/{MAT}: differs from",
     ),
@@ -310,7 +353,9 @@ def test_all_wrong_files_of_all_splits_are_listed_together(tmp_path):
     tree = make_tree(tmp_path / "tree")
     cut(fringe_path(tree, "train", "bowl_A0"))
     set_pixel(depth_path(tree, "val", "mug_A120"), np.nan)
-    write_mat(depth_path(tree, "test", "my_own_part_A300"), depthMapMeters=depth_of("my_own_part_A300"))
+    write_mat(
+        depth_path(tree, "test", "my_own_part_A300"), depthMapMeters=depth_of("my_own_part_A300")
+    )
     message = refusal(tree, tmp_path / "out")
     assert "3 problems" in message
     for name in ("bowl_A0.png", "mug_A120.mat", "my_own_part_A300.mat"):
@@ -322,7 +367,11 @@ def test_a_long_list_of_wrong_files_is_cut_with_their_count(tmp_path):
     for path in (tree / TRAINING / FOLDERS["raw"] / "train" / "depth").iterdir():
         path.write_bytes(b"")
     message = refusal(tree, tmp_path / "out").splitlines()
-    assert len(message) == 52 and "60 problems" in message[0] and message[-1].strip() == "... and 10 more"
+    assert (
+        len(message) == 52
+        and "60 problems" in message[0]
+        and message[-1].strip() == "... and 10 more"
+    )
 
 
 @pytest.mark.parametrize(
@@ -330,8 +379,14 @@ def test_a_long_list_of_wrong_files_is_cut_with_their_count(tmp_path):
     [
         (lambda t: None, "no such folder"),
         (lambda t: t.mkdir(), "expected training_datasets/"),
-        (lambda t: (t / "fpp_synthetic_dataset/mug/A0").mkdir(parents=True), "raw scans alone have no depth in mm"),
-        (lambda t: (t / TRAINING / "training_data_bgremoved_depth_raw").mkdir(parents=True), "only background-removed"),
+        (
+            lambda t: (t / "fpp_synthetic_dataset/mug/A0").mkdir(parents=True),
+            "raw scans alone have no depth in mm",
+        ),
+        (
+            lambda t: (t / TRAINING / "training_data_bgremoved_depth_raw").mkdir(parents=True),
+            "only background-removed",
+        ),
         (lambda t: (t / TRAINING / FOLDERS["raw"]).mkdir(parents=True), "holds no sample"),
     ],
 )
@@ -361,10 +416,14 @@ def test_an_interrupted_import_resumes_and_reads_a_changed_file_again(tmp_path, 
     write_mat(changed_file, depthMap=depth_of("mug_A0") + np.float32(1) * (depth_of("mug_A0") > 0))
 
     monkeypatch.setattr(
-        reader, "read", lambda self, sample: (read_samples.append(sample.sample), read(self, sample))[1]
+        reader,
+        "read",
+        lambda self, sample: (read_samples.append(sample.sample), read(self, sample))[1],
     )
     dataset = imported(tree, tmp_path / "out")
-    assert not any(sample.startswith("bowl") for sample in read_samples) and "mug_A0" in read_samples
+    assert (
+        not any(sample.startswith("bowl") for sample in read_samples) and "mug_A0" in read_samples
+    )
     assert dataset.depth_mm("mug_A0").max() == depth_of("mug_A0").max() + 1
     changed_file.write_bytes(content)
     shutil.rmtree(tmp_path / "out")
@@ -383,9 +442,24 @@ def test_a_finished_import_is_left_alone_unless_the_tree_changed(tmp_path):
 def test_the_command_imports_and_prints_a_summary(tmp_path, capsys):
     tree = make_tree(tmp_path / "tree", ALL_VARIANTS)
     save_rig(paper_rig(24), tmp_path / "rig.yaml")
-    assert command("import", tree, "--out", tmp_path / "out", "--workers", 1, "--rig", tmp_path / "rig.yaml") == 0
+    assert (
+        command(
+            "import",
+            tree,
+            "--out",
+            tmp_path / "out",
+            "--workers",
+            1,
+            "--rig",
+            tmp_path / "rig.yaml",
+        )
+        == 0
+    )
     message = capsys.readouterr().out
-    assert "train 6, validation 6, test 12 samples" in message and f"depth taken from {FOLDERS['raw']}" in message
+    assert (
+        "train 6, validation 6, test 12 samples" in message
+        and f"depth taken from {FOLDERS['raw']}" in message
+    )
     assert "assumed" not in message
 
 
@@ -428,4 +502,7 @@ def test_whole_numbers_are_said(tmp_path, capsys):
     for file in (tree / RAW).rglob("*.mat"):
         write_mat(file, depthMap=np.uint16(np.rint(scipy.io.loadmat(file)["depthMap"])))
     assert command("import", tree, "--out", tmp_path / "b", "--workers", 1) == 0
-    assert "warning: the depth files hold whole numbers, so depth is rounded" in capsys.readouterr().err
+    assert (
+        "warning: the depth files hold whole numbers, so depth is rounded"
+        in capsys.readouterr().err
+    )

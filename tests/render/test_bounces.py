@@ -1,6 +1,7 @@
 """Further bounces against theory: integrating sphere, a groove, light from the plane.
 
-Rays are a fixed sequence, so every deviation below is a constant of this code. Form factors by Lambert's formula.
+Rays are a fixed sequence, so every deviation below is a constant of this code. Form factors by
+Lambert's formula.
 """
 
 from functools import cache
@@ -23,7 +24,9 @@ def hollow_sphere():
     """A shell of 5 cm radius with a cavity of 4 cm: surfels, and which are of the cavity."""
     outer, inner = trimesh.creation.icosphere(4, 0.05), trimesh.creation.icosphere(4, 0.04)
     vertices = np.concatenate([outer.vertices, inner.vertices])
-    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]).astype(np.int32)
+    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]).astype(
+        np.int32
+    )
     surfels = Surfels.of(SolidMesh("shell", vertices, faces))
     cavity = np.linalg.norm(surfels.grid.position_m, axis=1) < 0.0449
     return surfels, cavity
@@ -36,7 +39,9 @@ def matrix(surfels):
 
 def bounced(surfels, direct, rho):
     """Irradiance by bounces (K,) of one pattern, without other light."""
-    return between_surfels(surfels, direct[:, None], np.zeros((len(direct), 1)), np.full(len(direct), rho))[:, 0]
+    return between_surfels(
+        surfels, direct[:, None], np.zeros((len(direct), 1)), np.full(len(direct), rho)
+    )[:, 0]
 
 
 @pytest.mark.parametrize("rho", [0.2, 0.8, 0.95])
@@ -57,7 +62,8 @@ def right_angle():
 
 
 def contour(points, normals, corners):
-    """Form factor from points (n, 3) to a polygon (m, 3) that lies above their horizons: Lambert 1760, exact."""
+    """Form factor from points (n, 3) to a polygon (m, 3) that lies above their horizons: Lambert
+    1760, exact."""
     total = np.zeros(len(points))
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         to_a, to_b = a - points, b - points
@@ -70,15 +76,23 @@ def contour(points, normals, corners):
 
 
 def groove(side=0.1, n=12):
-    """Radiosity of a right-angled groove, floor y and wall z, by n x n patches a side and Lambert's formula: patch
-    centres (n n, 2) along the edge and away from it, and the form factors (n n, n n) of either side to the other."""
-    across, away = np.meshgrid((np.arange(n) + 0.5) / n * side, (np.arange(n) + 0.5) / n * side, indexing="ij")
+    """Radiosity of a right-angled groove, floor y and wall z, by n x n patches a side and Lambert's
+    formula: patch centres (n n, 2) along the edge and away from it, and the form factors (n n, n n)
+    of either side to the other."""
+    across, away = np.meshgrid(
+        (np.arange(n) + 0.5) / n * side, (np.arange(n) + 0.5) / n * side, indexing="ij"
+    )
     centres = np.column_stack([across.ravel(), away.ravel(), np.zeros(n * n)])
     up = np.tile([0.0, 0.0, 1.0], (n * n, 1))
     factors = np.empty((n * n, n * n))
     half = side / n / 2
     for k, (x, z) in enumerate(zip(across.ravel(), away.ravel(), strict=True)):
-        patch = [[x - half, 0, z - half], [x + half, 0, z - half], [x + half, 0, z + half], [x - half, 0, z + half]]
+        patch = [
+            [x - half, 0, z - half],
+            [x + half, 0, z - half],
+            [x + half, 0, z + half],
+            [x - half, 0, z + half],
+        ]
         factors[:, k] = contour(centres, up, np.array(patch))
     return centres[:, :2], factors
 
@@ -99,7 +113,8 @@ def test_groove_of_two_squares():
     for points, facing in ((floor, [0, 0, 1.0]), (wall, [0, 1.0, 0])):
         found = at_points(surfels.grid, values, points, np.tile(facing, (n, 1)))[0]
         assert found.mean() == pytest.approx(expected.mean(), rel=0.02)
-        # A place's own error: noise of 128 rays and the width of a surfel, as a share of the groove's largest value.
+        # A place's own error: noise of 128 rays and the width of a surfel, as a share of the
+        # groove's largest value.
         assert np.sqrt(np.mean((found - expected) ** 2)) < 0.03 * expected.max()
         outside = at_points(surfels.grid, values, points, np.tile(np.negative(facing), (n, 1)))[0]
         np.testing.assert_array_equal(outside, 0)
@@ -110,7 +125,10 @@ SHAPES = {
     "box": solid(trimesh.creation.box((0.1, 0.2, 0.15))),
     "two boxes": solid(
         trimesh.util.concatenate(
-            [trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation([x, 0, z]) for x, z in ((0, 0), (0.14, 0.03))]
+            [
+                trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation([x, 0, z])
+                for x, z in ((0, 0), (0.14, 0.03))
+            ]
         )
     ),
 }
@@ -122,14 +140,16 @@ def test_rows_and_reciprocity(name):
     factors, area = matrix(surfels), surfels.grid.area_m2
     np.testing.assert_allclose(factors.sum(axis=1) + surfels.open_share, 1, atol=1e-12)
     assert 2500 < len(area) < 9000
-    # A_i F_ij = A_j F_ji: single pairs are noise, so by halves of the object, along each axis, within three standard
-    # errors of the rays that go across. Each carries the area of a surfel, by the number of rays.
+    # A_i F_ij = A_j F_ji: single pairs are noise, so by halves of the object, along each axis,
+    # within three standard errors of the rays that go across. Each carries the area of a surfel, by
+    # the number of rays.
     crossing = []
     for axis in range(3):
         place = surfels.grid.position_m[:, axis]
         upper = place > np.median(place)
         there, back = (
-            (area[one] @ factors[np.ix_(one, other)]).sum() for one, other in ((upper, ~upper), (~upper, upper))
+            (area[one] @ factors[np.ix_(one, other)]).sum()
+            for one, other in ((upper, ~upper), (~upper, upper))
         )
         error = np.sqrt((there + back) * area.mean() / RAYS)
         assert abs(there - back) <= 3 * error
@@ -141,7 +161,9 @@ def test_a_convex_object_gets_nothing_from_itself():
     surfels = Surfels.of(solid(trimesh.creation.icosphere(4, 0.08)))
     assert surfels.open_share.min() == 1 and surfels.form_factors.nnz == 0
     outside = np.random.default_rng(0).random((len(surfels.grid.area_m2), 2))
-    np.testing.assert_array_equal(between_surfels(surfels, outside, outside, np.full(len(outside), 0.9)), outside)
+    np.testing.assert_array_equal(
+        between_surfels(surfels, outside, outside, np.full(len(outside), 0.9)), outside
+    )
 
 
 def test_surfels_share_out_the_surface():
@@ -152,21 +174,29 @@ def test_surfels_share_out_the_surface():
     np.testing.assert_allclose(np.linalg.norm(surfels.open_directions, axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(points.mean(points.position_m), grid.position_m)
     # Open rays lie about their normal like the cosine: the mean of their cosine is 2/3.
-    cosine = (surfels.open_directions * np.repeat(grid.normal, np.diff(surfels.open_starts), axis=0)).sum(axis=1)
+    cosine = (
+        surfels.open_directions * np.repeat(grid.normal, np.diff(surfels.open_starts), axis=0)
+    ).sum(axis=1)
     assert cosine.mean() == pytest.approx(2 / 3, rel=2e-3)
 
 
 def test_both_sides_of_a_sheet_that_encloses_nothing():
-    """Half a spherical shell: its inside sees itself with half of its hemisphere (A_opening / A_inside), its outside
-    nothing, whichever way its triangles are turned."""
+    """Half a spherical shell: its inside sees itself with half of its hemisphere (A_opening /
+    A_inside), its outside nothing, whichever way its triangles are turned."""
     ball = trimesh.creation.icosphere(4, 0.06)
     half = ball.faces[(ball.triangles_center[:, 2] < 0)]
     for faces in (half, half[:, ::-1]):
-        surfels = Surfels.of(SolidMesh("bowl", np.asarray(ball.vertices), np.ascontiguousarray(faces, dtype=np.int32)))
+        surfels = Surfels.of(
+            SolidMesh(
+                "bowl", np.asarray(ball.vertices), np.ascontiguousarray(faces, dtype=np.int32)
+            )
+        )
         grid = surfels.grid
         inside = (grid.normal * grid.position_m).sum(axis=1) < 0
         assert grid.area_m2[inside].sum() == pytest.approx(grid.area_m2[~inside].sum(), rel=0.02)
-        assert np.average(surfels.open_share[inside], weights=grid.area_m2[inside]) == pytest.approx(0.5, abs=0.01)
+        assert np.average(
+            surfels.open_share[inside], weights=grid.area_m2[inside]
+        ) == pytest.approx(0.5, abs=0.01)
         assert surfels.open_share[~inside].min() == 1
 
 
@@ -178,31 +208,40 @@ def test_interpolation_reproduces_a_constant_and_a_ramp():
     constant, x = at_points(grid, values, np.asarray(points), mesh.face_normals[triangle])
     np.testing.assert_allclose(constant, 0.37, rtol=1e-6)
     assert np.abs(x - points[:, 0]).max() < 0.5 * grid.cell_m
-    far = at_points(grid, values, np.array([[0.5, 0.5, 0.5], [np.nan] * 3]), np.array([[0.0, 0, 1], [0, 0, 1]]))
+    far = at_points(
+        grid, values, np.array([[0.5, 0.5, 0.5], [np.nan] * 3]), np.array([[0.0, 0, 1], [0, 0, 1]])
+    )
     assert (far == 0).all()
 
 
 def test_light_from_the_background_plane_against_an_integral():
-    """Irradiance of a ball's back from the lit part of the plane, by the midpoint rule with the inverse square and the
-    cosines written out."""
+    """Irradiance of a ball's back from the lit part of the plane, by the midpoint rule with the
+    inverse square and the cosines written out."""
     light = PAPER
     plane = PlaneLight.of(RIG, light, PatternLight.of(RIG, light.projector))
     surfels = Surfels.of(solid(trimesh.creation.icosphere(4, 0.08)))
     offset = np.array([0.05, -0.02, 1.9])
     degrees = 120
     found = plane.upon(surfels, degrees, offset)[:, WHITE]
-    position, normal = turned(surfels.grid.position_m, degrees) + offset, turned(surfels.grid.normal, degrees)
+    position, normal = (
+        turned(surfels.grid.position_m, degrees) + offset,
+        turned(surfels.grid.normal, degrees),
+    )
     # The pattern's outer pixel edges, sent from the projector to 3.2 m.
     x = CENTRE[0] + 3.2 * (np.array([-0.5, 911.5]) - 455.5) / 1824
     y = CENTRE[1] + 3.2 * (np.array([-0.5, 1139.5]) - 569.5) / 1824
     n = 80
-    gx, gy = np.meshgrid(x[0] + (np.arange(n) + 0.5) / n * np.ptp(x), y[0] + (np.arange(n) + 0.5) / n * np.ptp(y))
+    gx, gy = np.meshgrid(
+        x[0] + (np.arange(n) + 0.5) / n * np.ptp(x), y[0] + (np.arange(n) + 0.5) / n * np.ptp(y)
+    )
     gx, gy = gx.ravel(), gy.ravel()
     from_light = np.sqrt((gx - CENTRE[0]) ** 2 + (gy - CENTRE[1]) ** 2 + 3.2**2)
     leaving = 0.8 * 1.5**2 / from_light**2 * 3.2 / from_light
     expected = np.zeros(len(found))
     for k in range(len(found)):
-        to = np.stack([gx - position[k, 0], gy - position[k, 1], np.full(gx.size, 3.2 - position[k, 2])])
+        to = np.stack(
+            [gx - position[k, 0], gy - position[k, 1], np.full(gx.size, 3.2 - position[k, 2])]
+        )
         squared = (to**2).sum(axis=0)
         cosines = np.clip(normal[k] @ to, 0, None) * to[2] / squared
         expected[k] = (leaving * cosines / squared).sum() / np.pi * np.ptp(x) * np.ptp(y) / n**2

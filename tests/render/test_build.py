@@ -1,4 +1,5 @@
-"""Building: the same bytes for any order of objects and number of workers, and settings that are refused."""
+"""Building: the same bytes for any order of objects and number of workers, and settings that are
+refused."""
 
 import json
 from dataclasses import replace
@@ -56,19 +57,29 @@ def test_storing_one_frame_keeps_the_bytes_of_frame_and_depth(opened, tmp_path):
     for sample in dataset.samples("train"):
         np.testing.assert_array_equal(dataset.frame(sample, 0), opened.frame(sample, 0))
         np.testing.assert_array_equal(dataset.depth_mm(sample), opened.depth_mm(sample))
-        np.testing.assert_array_equal(dataset.depth_mm(sample, "depth_exact"), opened.depth_mm(sample, "depth_exact"))
+        np.testing.assert_array_equal(
+            dataset.depth_mm(sample, "depth_exact"), opened.depth_mm(sample, "depth_exact")
+        )
         assert dataset.measured(sample) == opened.measured(sample)
 
 
 @pytest.mark.parametrize("change", [{"seed": 43}, {"light": NOISY}, {"placement": "varied"}])
 def test_what_decides_the_bytes_changes_them(opened, tmp_path, change):
-    build(tmp_path / "other", tiny_settings(objects=("cork",), stored="single_shot", **change), workers=1)
+    build(
+        tmp_path / "other",
+        tiny_settings(objects=("cork",), stored="single_shot", **change),
+        workers=1,
+    )
     dataset = DatasetFolder(tmp_path / "other")
     assert dataset.fingerprint != opened.fingerprint
     for sample in dataset.samples("train"):
         differing = (dataset.frame(sample, 0) != opened.frame(sample, 0)).mean()
-        assert differing > (0.02 if "placement" in change else 0.2)  # elsewhere background and noise are the same
-        moved = (dataset.depth_mm(sample, "depth_exact") != opened.depth_mm(sample, "depth_exact")).any()
+        assert differing > (
+            0.02 if "placement" in change else 0.2
+        )  # elsewhere background and noise are the same
+        moved = (
+            dataset.depth_mm(sample, "depth_exact") != opened.depth_mm(sample, "depth_exact")
+        ).any()
         assert moved == ("placement" in change)
 
 
@@ -94,7 +105,10 @@ def test_every_view_has_its_object_in_range(opened):
         assert inside.min() >= 1500 and inside.max() <= 2100
         assert 0.005 < (exact > 0).mean() < 0.4
         row = opened.measured(sample)
-        assert (row["depth_min_mm"], row["depth_max_mm"]) == (depth[depth > 0].min(), depth[depth > 0].max())
+        assert (row["depth_min_mm"], row["depth_max_mm"]) == (
+            depth[depth > 0].min(),
+            depth[depth > 0].max(),
+        )
         assert row["object_px"] == (depth > 0).sum()
         assert row["undecoded_px"] == ((exact > 0) & (depth == 0)).sum() < 0.1 * row["exact_px"]
         assert row["distance_mm"] == 1800
@@ -105,7 +119,9 @@ def test_users_mesh_goes_the_same_way(tmp_path):
     path = tmp_path / "My Part.stl"
     trimesh.creation.icosphere(3, 0.1).export(path)
     mesh = single_mesh(path)
-    settings = BuildSettings(paper_rig(TINY_SIZE), (mesh.name,), stored="single_shot", user_meshes=(mesh,))
+    settings = BuildSettings(
+        paper_rig(TINY_SIZE), (mesh.name,), stored="single_shot", user_meshes=(mesh,)
+    )
     build(tmp_path / "set", settings, workers=1)
     dataset = DatasetFolder(tmp_path / "set")
     assert dataset.splits == {"test": [f"my_part_{view}" for view in VIEWS]}
@@ -123,24 +139,40 @@ def test_object_that_does_not_fit_ends_the_build_by_name(tmp_path):
     path = tmp_path / "huge.stl"
     trimesh.creation.box((2, 2, 2)).export(path)
     mesh = single_mesh(path)
-    settings = BuildSettings(paper_rig(TINY_SIZE), ("cork", "huge"), user_meshes=(mesh,), stored="single_shot")
+    settings = BuildSettings(
+        paper_rig(TINY_SIZE), ("cork", "huge"), user_meshes=(mesh,), stored="single_shot"
+    )
     with pytest.raises(MeshError, match=r"'huge'.*scale it"):
-        build(tmp_path / "set", settings, workers=2)  # through a worker process, with the whole message
+        build(
+            tmp_path / "set", settings, workers=2
+        )  # through a worker process, with the whole message
 
 
 def test_a_view_without_an_object_pixel_ends_the_build_with_its_cause(tmp_path, capsys):
-    """An object smaller than a pixel of the image, and the same in a light that leaves none to decode."""
+    """An object smaller than a pixel of the image, and the same in a light that leaves none to
+    decode."""
     trimesh.creation.box((4e-4,) * 3).export(tmp_path / "tiny.stl")
     trimesh.creation.box((0.2,) * 3).export(tmp_path / "box.stl")
     (tmp_path / "dark.yaml").write_text("name: dark\ncamera: {exposure: 0.01}\n")
     words = ["--size", "224", "--config", "single_shot", "--workers", "1"]
-    assert main(["build", "--out", str(tmp_path / "a"), "--mesh", str(tmp_path / "tiny.stl"), *words]) == 2
+    assert (
+        main(["build", "--out", str(tmp_path / "a"), "--mesh", str(tmp_path / "tiny.stl"), *words])
+        == 2
+    )
     said = capsys.readouterr().err
-    assert "object 'tiny' is on no pixel in view A0: it is 0.4 mm large" in said and "scale it up" in said
+    assert (
+        "object 'tiny' is on no pixel in view A0: it is 0.4 mm large" in said
+        and "scale it up" in said
+    )
     words += ["--light", str(tmp_path / "dark.yaml")]
-    assert main(["build", "--out", str(tmp_path / "b"), "--mesh", str(tmp_path / "box.stl"), *words]) == 2
+    assert (
+        main(["build", "--out", str(tmp_path / "b"), "--mesh", str(tmp_path / "box.stl"), *words])
+        == 2
+    )
     said = capsys.readouterr().err
-    assert "sample 'box_A0': none of its" in said and "(low modulation" in said and "--light" in said
+    assert (
+        "sample 'box_A0': none of its" in said and "(low modulation" in said and "--light" in said
+    )
 
 
 # ---- plans and presets
@@ -149,7 +181,9 @@ def test_a_view_without_an_object_pixel_ends_the_build_with_its_cause(tmp_path, 
 def test_split_is_forty_five_five_by_object():
     parts = {split: [name for name in OBJECTS if split_of(name) == split] for split in SPLITS}
     assert [len(parts[split]) for split in SPLITS] == [40, 5, 5]
-    assert {"power_drill", "magazine_stack", "container_bottle", "wooden_boards"} <= set(parts["test"])
+    assert {"power_drill", "magazine_stack", "container_bottle", "wooden_boards"} <= set(
+        parts["test"]
+    )
     assert set(VALIDATION_OBJECTS) <= set(OBJECTS) and set(TEST_OBJECTS) <= set(OBJECTS)
     assert len(set(OBJECTS)) == 50
 
@@ -157,7 +191,9 @@ def test_split_is_forty_five_five_by_object():
 def test_full_preset_is_the_papers_set():
     objects, size = PRESETS["full"]
     assembly = assembly_of(BuildSettings(paper_rig(size), objects))
-    rows = {split: sum(len(p.samples) for p in assembly.plans if p.split == split) for split in SPLITS}
+    rows = {
+        split: sum(len(p.samples) for p in assembly.plans if p.split == split) for split in SPLITS
+    }
     assert rows == {"train": 240, "validation": 30, "test": 30}
     frames = stored_frames(PAPER_SEQUENCE, "all")
     assert len(frames) * sum(rows.values()) == 15_600
@@ -168,7 +204,9 @@ def test_full_preset_is_the_papers_set():
 def test_mini_preset_has_every_split():
     objects, size = PRESETS["mini"]
     assert objects == MINI_OBJECTS and len(objects) >= 4
-    assert {plan.split for plan in plan_build(BuildSettings(paper_rig(size), objects))} == set(SPLITS)
+    assert {plan.split for plan in plan_build(BuildSettings(paper_rig(size), objects))} == set(
+        SPLITS
+    )
 
 
 @pytest.mark.parametrize(
@@ -226,13 +264,20 @@ def row(sample="bowl_A0", depth=None, frames=None):
 
 def write(tmp_path, rows):
     (plan,) = plan_shards("train", {"bowl": [("bowl_A0", "bowl", "A0")]})
-    manifest = Manifest("generated", {}, {}, paper_rig().to_dict(), (8, 6), "single_shot", exact=True)
+    manifest = Manifest(
+        "generated", {}, {}, paper_rig().to_dict(), (8, 6), "single_shot", exact=True
+    )
     return ShardWriter(manifest).write(tmp_path, plan, rows)
 
 
 @pytest.mark.parametrize(
     ("value", "message"),
-    [(np.nan, "NaN or infinite"), (np.inf, "NaN or infinite"), (-1.0, "negative"), (0.0, "no pixel is above 0")],
+    [
+        (np.nan, "NaN or infinite"),
+        (np.inf, "NaN or infinite"),
+        (-1.0, "negative"),
+        (0.0, "no pixel is above 0"),
+    ],
 )
 def test_writer_takes_no_bad_depth(tmp_path, value, message):
     depth = np.full((8, 6), 1800 if value else 0, np.float32)
@@ -246,7 +291,10 @@ def test_writer_takes_no_bad_depth(tmp_path, value, message):
     ("rows", "message"),
     [
         ([], "expected sample 'bowl_A0', got nothing"),
-        ([row(frames={0: np.zeros((6, 8), np.uint8)})], r"frame_00: expected uint8 \(8, 6\), got uint8 \(6, 8\)"),
+        (
+            [row(frames={0: np.zeros((6, 8), np.uint8)})],
+            r"frame_00: expected uint8 \(8, 6\), got uint8 \(6, 8\)",
+        ),
         ([row(depth=np.full((8, 6), 1800.0))], r"depth: expected float32 \(8, 6\), got float64"),
     ],
 )

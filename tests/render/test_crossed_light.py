@@ -36,12 +36,19 @@ def test_light_is_the_image_through_response_and_blur(response, defocus_px):
     fine, image = 4, response_table(response)[family.image(912, 1140, 0)[150:290, 150:290]]
     places = np.arange(139 * fine + 1) / fine
     whole = map_coordinates(image, np.meshgrid(places, places, indexing="ij"), order=1)
-    variance = light.pixel_blur_px**2 + (defocus_variance_px2(rig, light, distance_m)[0] if defocus_px else 0.0)
-    area = [rig.projector_px_per_image_px(direction) ** 2 / 12 for direction in ("horizontal", "vertical")]
+    variance = light.pixel_blur_px**2 + (
+        defocus_variance_px2(rig, light, distance_m)[0] if defocus_px else 0.0
+    )
+    area = [
+        rig.projector_px_per_image_px(direction) ** 2 / 12
+        for direction in ("horizontal", "vertical")
+    ]
     blurred = gaussian_filter(whole, [fine * np.sqrt(variance + a) for a in area])
     expected = map_coordinates(blurred, [(v - 150) * fine, (u - 150) * fine], order=1)
     assert np.ptp(expected) > 0.1
-    np.testing.assert_allclose(out[index], 2 * expected, atol=0.008)  # of which rounding to 8 bits 0.004
+    np.testing.assert_allclose(
+        out[index], 2 * expected, atol=0.008
+    )  # of which rounding to 8 bits 0.004
 
 
 def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path):
@@ -50,7 +57,11 @@ def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path)
     build(tmp_path / "crossed", settings, 1)
     build(tmp_path / "paper", BuildSettings(paper_rig(240), ("cork",), stored="single_shot"), 1)
     opened, paper = DatasetFolder(tmp_path / "crossed"), DatasetFolder(tmp_path / "paper")
-    assert opened.configs == ("single_shot", "crossed") and opened.manifest.stored_frames == (0, 1, 2)
+    assert opened.configs == ("single_shot", "crossed") and opened.manifest.stored_frames == (
+        0,
+        1,
+        2,
+    )
     assert not verify(tmp_path / "crossed")
     for view in VIEWS[:2]:
         depth_mm, other_mm = (dataset.depth_mm(f"cork_{view}") for dataset in (opened, paper))
@@ -61,7 +72,9 @@ def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path)
 
 
 def test_what_can_not_be_built_is_said():
-    alone = replace(paper_rig(240), sequence=CodedSequence(None, None, ("crossed",), Crossed((18.0, 14.0))))
+    alone = replace(
+        paper_rig(240), sequence=CodedSequence(None, None, ("crossed",), Crossed((18.0, 14.0)))
+    )
     with pytest.raises(BuildError, match="no ground truth can be decoded; add the horizontal"):
         BuildSettings(alone, ("cork",))
     with pytest.raises(BuildError, match="frames 'crossed': this rig's sequence has none"):

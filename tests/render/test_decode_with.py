@@ -1,4 +1,5 @@
-"""Datasets whose ground truth is decoded with the rig that a calibration found, not with the one that photographed."""
+"""Datasets whose ground truth is decoded with the rig that a calibration found, not with the one
+that photographed."""
 
 import json
 from dataclasses import replace
@@ -32,7 +33,17 @@ def lab(tmp_path_factory):
     """Folder of a dataset built by the command with --decode-with, and the dataset."""
     folder = tmp_path_factory.mktemp("lab")
     save_rig(FOUND, folder / "found.yaml")
-    asked = ["build", "--out", str(folder / "data"), "--objects", "cork", "--size", str(TINY_SIZE), "--workers", "1"]
+    asked = [
+        "build",
+        "--out",
+        str(folder / "data"),
+        "--objects",
+        "cork",
+        "--size",
+        str(TINY_SIZE),
+        "--workers",
+        "1",
+    ]
     assert main([*asked, "--decode-with", str(folder / "found.yaml")]) == 0
     return DatasetFolder(folder / "data")
 
@@ -50,11 +61,17 @@ def test_frames_and_exact_depth_are_the_true_rigs_and_depth_and_rig_the_found_on
         assert lab.measured(sample)["gt_rmse_mm"] > 1.5 * opened.measured(sample)["gt_rmse_mm"]
 
 
-def test_info_says_that_another_rig_photographed_and_how_far_both_are_apart(lab, opened, tiny, capsys):
+def test_info_says_that_another_rig_photographed_and_how_far_both_are_apart(
+    lab, opened, tiny, capsys
+):
     error = volume_error_mm(FOUND, TRUE)
     assert main(["info", str(lab.path)]) == 0
     out = capsys.readouterr().out
-    assert "photographed by another" in out and f"{error.rms_mm:.3f} mm RMS" in out and "photographed_by" not in out
+    assert (
+        "photographed by another" in out
+        and f"{error.rms_mm:.3f} mm RMS" in out
+        and "photographed_by" not in out
+    )
     assert main(["info", str(lab.path), "--json", "-"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content["calibration_error"] == pytest.approx(error._asdict())
@@ -73,7 +90,10 @@ def test_a_build_with_another_rig_to_decode_with_is_another_dataset(lab):
     ("other", "message"),
     [
         (paper_rig(480), "camera of 480 x 480 px"),
-        (replace(TRUE, projector=replace(TRUE.projector, width=1000)), "projector of 1000 x 1140 px"),
+        (
+            replace(TRUE, projector=replace(TRUE.projector, width=1000)),
+            "projector of 1000 x 1140 px",
+        ),
         (replace(TRUE, pitch_vertical_px=20.0), "another sequence or pitch"),
         (replace(TRUE, sequence=Sequence(steps=12)), "another sequence or pitch"),
     ],

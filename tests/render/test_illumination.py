@@ -1,4 +1,5 @@
-"""Brightness of single points against closed forms: inverse square, cosine, falloff, gloss, the pattern's rim."""
+"""Brightness of single points against closed forms: inverse square, cosine, falloff, gloss, the
+pattern's rim."""
 
 from dataclasses import replace
 
@@ -6,7 +7,12 @@ import numpy as np
 import pytest
 from rendering import ALL_PIXELS, CENTRE, DIRECT, RIG, X, Y, plane
 
-from fpp_ml_bench.loaders.render.illumination import Material, in_pattern, light_surface, reflectance
+from fpp_ml_bench.loaders.render.illumination import (
+    Material,
+    in_pattern,
+    light_surface,
+    reflectance,
+)
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.sensor import Exposure, camera_noise
 from fpp_ml_bench.optics.rig import rotation_matrix
@@ -20,9 +26,14 @@ def lit_by(light, points, normals):
 
 
 def test_light_on_the_far_side_does_not_reach_the_camera():
-    """A projector 3 m ahead that looks back: exactly 0, so that the decoder masks it for want of modulation."""
+    """A projector 3 m ahead that looks back: exactly 0, so that the decoder masks it for want of
+    modulation."""
     turn = rotation_matrix((0.0, np.pi, 0.0))
-    behind = replace(RIG, rotation=turn.tolist(), translation_m=tuple((-turn @ np.array([-0.125, 0.1, 3.0])).tolist()))
+    behind = replace(
+        RIG,
+        rotation=turn.tolist(),
+        translation_m=tuple((-turn @ np.array([-0.125, 0.1, 3.0])).tolist()),
+    )
     assert not light_surface(*plane(1.8), behind, DIRECT, PATTERN).gain.any()
 
 
@@ -46,11 +57,14 @@ def test_falloff_is_a_power_of_the_cosine_to_the_projectors_axis(falloff):
     plain = lit_by(DIRECT, points, normals).gain
     cosine = points[:, 2] / np.linalg.norm(points - CENTRE, axis=1)
     light = DIRECT.changed("projector", falloff=falloff)
-    np.testing.assert_allclose(lit_by(light, points, normals).gain, plain * cosine**falloff, rtol=2e-6)
+    np.testing.assert_allclose(
+        lit_by(light, points, normals).gain, plain * cosine**falloff, rtol=2e-6
+    )
 
 
 def test_reference_grey_is_that_of_the_matte_part():
-    """A facing surface at 1.5 m along the axis: 180 of any albedo; with gloss the lobe comes on top of it."""
+    """A facing surface at 1.5 m along the axis: 180 of any albedo; with gloss the lobe comes on top
+    of it."""
     point, normal = np.array([[-0.125, 0.1, 1.5]]), np.array([[0.0, 0.0, -1.0]])
     for albedo in (0.2, 0.8):
         light = DIRECT.changed("surface", albedo=albedo)
@@ -59,8 +73,8 @@ def test_reference_grey_is_that_of_the_matte_part():
 
 
 def test_gloss_is_where_the_mirror_direction_is():
-    """A plane of glossy material: brightest, over what a matte one is, half-way between the two centres, and there as
-    `reflectance` says with the half vector on the normal."""
+    """A plane of glossy material: brightest, over what a matte one is, half-way between the two
+    centres, and there as `reflectance` says with the half vector on the normal."""
     points, normals = plane(1.8)
     matte = lit_by(DIRECT, points, normals).gain
     light = DIRECT.changed("surface", gloss=0.3, roughness=0.25)
@@ -96,7 +110,8 @@ def test_rays_that_see_nothing_stay_dark():
 
 
 def test_nothing_in_range_saturates_at_the_defaults():
-    """Any surface from 1.5 m on, turned any way, white pattern, default noise: below 255 on every pixel."""
+    """Any surface from 1.5 m on, turned any way, white pattern, default noise: below 255 on every
+    pixel."""
     rng = np.random.default_rng(1)
     depth = rng.uniform(1.5, 2.1, X.size)
     depth[: X.size // 4] = 1.5

@@ -4,7 +4,14 @@ import pytest
 import yaml
 
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.render.light import LIGHTS, NAMED, CameraLight, Light, load_light, named_light
+from fpp_ml_bench.loaders.render.light import (
+    LIGHTS,
+    NAMED,
+    CameraLight,
+    Light,
+    load_light,
+    named_light,
+)
 
 
 def written(tmp_path, text):
@@ -25,7 +32,9 @@ def test_named_lights_are_the_files_beside_the_module(name):
             expected = tuple(number) if isinstance(number, list) else number
             assert getattr(read, part) == expected
         assert isinstance(value, dict) or read == value
-    assert Light.model_validate(yaml.safe_load(yaml.safe_dump(light.model_dump(mode="json")))) == light
+    assert (
+        Light.model_validate(yaml.safe_load(yaml.safe_dump(light.model_dump(mode="json")))) == light
+    )
 
 
 def test_named_lights_are_all_the_files_there_are():
@@ -35,21 +44,26 @@ def test_named_lights_are_all_the_files_there_are():
 def test_the_papers_light_is_plain():
     light = named_light("paper")
     assert light.projector == light.projector.model_construct()  # every default is "off"
-    assert light.surface.gloss == 0 and light.surface.textures == "none" and not light.bounces.shadows
+    assert (
+        light.surface.gloss == 0 and light.surface.textures == "none" and not light.bounces.shadows
+    )
     assert light.camera.exposure == 1 and light.camera.response == 1 and light.camera.bits == 8
     assert (light.motion_mm, light.calibration_px) == (0, 0)
 
 
 def test_a_file_may_name_as_little_as_its_name(tmp_path):
     assert load_light(written(tmp_path, "name: mine")) == Light(name="mine")
-    full = load_light(written(tmp_path, "name: mine\ncamera: {full_well_e: null, exposure: [0.5, 2], bits: 12}\n"))
+    full = load_light(
+        written(tmp_path, "name: mine\ncamera: {full_well_e: null, exposure: [0.5, 2], bits: 12}\n")
+    )
     assert full.camera == CameraLight(full_well_e=None, exposure=(0.5, 2.0), bits=12)
 
 
 def test_every_wrong_key_is_named(tmp_path):
     path = written(
         tmp_path,
-        "name: mine\nprojector: {gamma: 2.2, falloff: 9}\nsurface: {albedo: '0.8', textures: marble}\n"
+        "name: mine\nprojector: {gamma: 2.2, falloff: 9}\nsurface: {albedo: '0.8', textures: "
+        "marble}\n"
         "bounces: {shadows: 1}\ncamera: {bits: 9, exposure: [2, 1]}\nambient_grey: -1\nlamp: 3\n",
     )
     with pytest.raises(BuildError) as error:

@@ -1,4 +1,5 @@
-"""Users' own meshes: the four formats with scale and pose, and every way a file or a list of them can be wrong."""
+"""Users' own meshes: the four formats with scale and pose, and every way a file or a list of them
+can be wrong."""
 
 import shutil
 from pathlib import Path
@@ -12,7 +13,13 @@ from scipy.spatial.transform import Rotation
 from fpp_ml_bench.constants import OBJECTS
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.mesh_files import read_mesh
-from fpp_ml_bench.loaders.render.meshes import load_user_mesh, read_mesh_list, single_mesh, solid_mesh, write_ply
+from fpp_ml_bench.loaders.render.meshes import (
+    load_user_mesh,
+    read_mesh_list,
+    single_mesh,
+    solid_mesh,
+    write_ply,
+)
 from fpp_ml_bench.loaders.render.scene import UserMesh
 
 SUFFIXES = ("obj", "ply", "stl", "glb")
@@ -26,7 +33,8 @@ def wedge():
 
 
 def corner_distance(points, expected):
-    """Largest distance from a vertex of either set to the nearest of the other (STL repeats vertices)."""
+    """Largest distance from a vertex of either set to the nearest of the other (STL repeats
+    vertices)."""
     apart = np.linalg.norm(points[:, None] - expected[None], axis=2)
     return max(apart.min(axis=0).max(), apart.min(axis=1).max())
 
@@ -38,12 +46,16 @@ def test_scale_turns_and_shift(tmp_path, wedge, suffix, centre):
     wedge.export(path)
     angles, offset = (20.0, -35.0, 100.0), (0.01, -0.02, 0.03)
     mesh = load_user_mesh(UserMesh("part", str(path), 0.001, angles, offset, centre))
-    expected = Rotation.from_euler("xyz", angles, degrees=True).apply(wedge.vertices * 0.001)  # about the fixed axes
+    expected = Rotation.from_euler("xyz", angles, degrees=True).apply(
+        wedge.vertices * 0.001
+    )  # about the fixed axes
     if centre:
         expected -= (expected.max(axis=0) + expected.min(axis=0)) / 2
     assert corner_distance(mesh.vertices_m, expected + offset) < 1e-7
     assert len(mesh.faces) == len(wedge.faces)
-    assert mesh.name == "part" and mesh.vertices_m.dtype == np.float64 and mesh.faces.dtype == np.int32
+    assert (
+        mesh.name == "part" and mesh.vertices_m.dtype == np.float64 and mesh.faces.dtype == np.int32
+    )
     again = trimesh.Trimesh(mesh.vertices_m, mesh.faces)  # merges what STL repeats
     assert again.is_watertight and again.volume == pytest.approx(wedge.volume * 1e-9, rel=1e-5)
 
@@ -169,12 +181,21 @@ def test_single_mesh_is_named_after_its_file(part):
         ([{"name": "mug", "path": "PART"}], "one of the benchmark's own"),
         ([{"name": "gear", "path": "PART"}], "one of the benchmark's own"),
         ([{"name": "x", "path": "nothing.stl"}], "no mesh file"),
-        ([{"name": "x", "path": "PART", "split": "val"}], r"split: Input should be .* \(got 'val'\)"),
+        (
+            [{"name": "x", "path": "PART", "split": "val"}],
+            r"split: Input should be .* \(got 'val'\)",
+        ),
         ([{"name": "x", "path": "PART", "scale": 0}], "scale: Input should be greater than 0"),
         ([{"name": "x", "path": "PART", "scale": True}], "scale: Input should be a valid number"),
         ([{"name": "x", "path": "PART", "rotation_deg": [0, 0]}], "rotation_deg.2: is missing"),
-        ([{"name": "x", "path": "PART", "offset_m": [0, 0, None]}], "offset_m.2: Input should be a valid number"),
-        ([{"name": "x", "path": "PART", "centre": "yes"}], "centre: Input should be a valid boolean"),
+        (
+            [{"name": "x", "path": "PART", "offset_m": [0, 0, None]}],
+            "offset_m.2: Input should be a valid number",
+        ),
+        (
+            [{"name": "x", "path": "PART", "centre": "yes"}],
+            "centre: Input should be a valid boolean",
+        ),
         ([{"name": "x", "path": "PART"}, {"name": "x", "path": "PART"}], "given twice"),
         ([{"name": "ok", "path": "PART"}, {"name": "x", "path": "PART", "scale": 0}], "entry 2"),
     ],
@@ -182,7 +203,8 @@ def test_single_mesh_is_named_after_its_file(part):
 def test_bad_lists_are_refused(part, content, says):
     if isinstance(content, list):
         content = [
-            {k: part.name if v == "PART" else v for k, v in e.items()} if isinstance(e, dict) else e for e in content
+            {k: part.name if v == "PART" else v for k, v in e.items()} if isinstance(e, dict) else e
+            for e in content
         ]
     path = write_list(part.parent, content)
     with pytest.raises(MeshError, match=says) as caught:
@@ -202,9 +224,15 @@ def test_own_names_can_never_meet_the_benchmarks(part):
         single_mesh(path)
 
 
-def test_a_mesh_is_read_from_the_present_folder_by_a_process_that_started_in_another(tmp_path, monkeypatch):
-    """The process that read an earlier mesh waits for the next one, also when the folder it started in is gone."""
-    texts = ["mtllib paint.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "newmtl a\nKd {} 0 0\n"]
+def test_a_mesh_is_read_from_the_present_folder_by_a_process_that_started_in_another(
+    tmp_path, monkeypatch
+):
+    """The process that read an earlier mesh waits for the next one, also when the folder it started
+    in is gone."""
+    texts = [
+        "mtllib paint.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "newmtl a\nKd {} 0 0\n",
+    ]
     hashes = []
     for name, red in (("first", 0.2), ("second", 0.9)):
         folder = tmp_path / name

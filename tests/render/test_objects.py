@@ -1,4 +1,5 @@
-"""The ground-truth meshes: closed, repeatable, inside the working range; the 50 are of the paper's scene statistics."""
+"""The ground-truth meshes: closed, repeatable, inside the working range; the 50 are of the paper's
+scene statistics."""
 
 import subprocess
 import sys
@@ -8,7 +9,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from fpp_ml_bench.constants import OBJECTS, STANDOFF_M, UNSEEN, VIEW_DEGREES, WORKING_RANGE_MM, split_of
+from fpp_ml_bench.constants import (
+    OBJECTS,
+    STANDOFF_M,
+    UNSEEN,
+    VIEW_DEGREES,
+    WORKING_RANGE_MM,
+    split_of,
+)
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.builder import plan_build
 from fpp_ml_bench.loaders.render.meshes import MESHES_FILE, pack_meshes, solid_mesh, stored_mesh
@@ -38,10 +46,13 @@ def _mesh(name):
 
 
 def _visible_depths_mm(solid):
-    """For each view, depth (n,) of the pixels that hit; the camera stands 1.8 m before the turning axis."""
+    """For each view, depth (n,) of the pixels that hit; the camera stands 1.8 m before the turning
+    axis."""
     line = (np.arange(SIZE) - (SIZE - 1) / 2) * IMAGE_PX / SIZE / FOCAL_PX
     rays = PixelRays(*np.meshgrid(line, line))
-    placed = (np.add(turned(solid.vertices_m, degrees), [0, 0, STANDOFF_M]) for degrees in VIEW_DEGREES)
+    placed = (
+        np.add(turned(solid.vertices_m, degrees), [0, 0, STANDOFF_M]) for degrees in VIEW_DEGREES
+    )
     return [1000.0 * TracedObject(solid, vertices_m).primary(rays).depth_m for vertices_m in placed]
 
 
@@ -63,11 +74,16 @@ def test_a_packed_mesh_is_read_as_it_was(monkeypatch, tmp_path):
 
 @pytest.mark.processes
 def test_the_drawings_give_the_meshes():
-    """With the manifold3d that CI pins. One of each module, and one of those that are drawn by a formula."""
+    """With the manifold3d that CI pins. One of each module, and one of those that are drawn by a
+    formula."""
     names = ("banana", "lighting_candles", "power_drill", "gear", "blob")
     script = Path(__file__).parents[2] / "benchmarks/objects/draw.py"
-    done = subprocess.run([sys.executable, script, "--check", *names], capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "5 of 5 drawings are the package's meshes\n"), done.stderr
+    done = subprocess.run(
+        [sys.executable, script, "--check", *names], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (0, "5 of 5 drawings are the package's meshes\n"), (
+        done.stderr
+    )
 
 
 def test_the_unseen_objects_are_others_and_all_in_the_test_split():
@@ -81,7 +97,10 @@ def test_the_unseen_objects_are_others_and_all_in_the_test_split():
 
 @pytest.mark.parametrize(
     ("most_of_hull", "names"),
-    [(0.45, ("bowl", "mug")), (0.85, ("v_groove", "concave_dish", "hinged_leaves", "honeycomb", "hollow_cube"))],
+    [
+        (0.45, ("bowl", "mug")),
+        (0.85, ("v_groove", "concave_dish", "hinged_leaves", "honeycomb", "hollow_cube")),
+    ],
     ids=["vessels", "concave"],
 )
 def test_hollow_ones_are_far_from_their_hull(meshes, most_of_hull, names):
@@ -108,7 +127,10 @@ def test_mesh_is_centred_and_within_the_working_range(meshes, name):
     vertices = meshes[name].vertices
     np.testing.assert_allclose(vertices.min(axis=0) + vertices.max(axis=0), 0, atol=1e-12)
     near, far = (depth / 1000 for depth in WORKING_RANGE_MM)
-    assert np.hypot(vertices[:, 0], vertices[:, 1]).max() <= min(STANDOFF_M - near, far - STANDOFF_M) - 0.004
+    assert (
+        np.hypot(vertices[:, 0], vertices[:, 1]).max()
+        <= min(STANDOFF_M - near, far - STANDOFF_M) - 0.004
+    )
     for degrees in VIEW_DEGREES:
         across, down, away = turned(vertices, degrees).T
         depth = away + STANDOFF_M

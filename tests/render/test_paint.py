@@ -1,4 +1,5 @@
-"""Users' meshes with colours: linear luminance, interpolation and images against closed forms, and damaged files."""
+"""Users' meshes with colours: linear luminance, interpolation and images against closed forms, and
+damaged files."""
 
 import json
 import os
@@ -28,7 +29,11 @@ QUAD = "v 0 -0.1 -0.1\nv 0 0.1 -0.1\nv 0 0.1 0.1\nv 0 -0.1 0.1\n"
 
 def write_quad(folder, image, name="quad.obj"):
     """A square of 0.2 m that faces the first view, as OBJ, MTL and PNG; u to its +y, v up."""
-    text = "mtllib quad.mtl\n" + QUAD + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl paint\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+    text = (
+        "mtllib quad.mtl\n"
+        + QUAD
+        + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl paint\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+    )
     (folder / name).write_text(text)
     (folder / "quad.mtl").write_text("newmtl paint\nKd 0 0 0\nmap_Kd quad.png\n")
     Image.fromarray(image).save(folder / "quad.png")
@@ -45,7 +50,9 @@ def two_colours(width=64):
 def luminance(mesh, points):
     """Luminance at points (n, 3) of a mesh whose triangles lie in the plane x = 0."""
     corners = mesh.vertices_m[mesh.faces]
-    weights = np.array([barycentric(corners, np.broadcast_to(p, (len(corners), 3))) for p in points])
+    weights = np.array(
+        [barycentric(corners, np.broadcast_to(p, (len(corners), 3))) for p in points]
+    )
     back = (weights[..., None] * corners[None]).sum(axis=2)
     triangle = np.linalg.norm(back - np.asarray(points)[:, None], axis=2).argmin(axis=1)
     assert mesh.paint is not None
@@ -56,7 +63,9 @@ def test_luminance_is_that_of_the_standards():
     """IEC 61966-2-1: half of sRGB is 0.214 in linear light; BT.709: its weights add up to 1."""
     level = np.arange(256)
     linear = np.where(level <= 10, level / 255 / 12.92, ((level / 255 + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(linear_luminance(np.repeat(level.astype(np.uint8)[:, None], 3, 1)), linear, atol=1e-7)
+    np.testing.assert_allclose(
+        linear_luminance(np.repeat(level.astype(np.uint8)[:, None], 3, 1)), linear, atol=1e-7
+    )
     assert np.interp(0.5, level / 255, linear) == pytest.approx(0.2140, abs=1e-4)
     primaries = linear_luminance(np.diag([255, 255, 255]).astype(np.uint8))
     np.testing.assert_allclose(primaries, [0.2126, 0.7152, 0.0722], atol=1e-7)
@@ -71,7 +80,15 @@ def test_sixteen_bits_and_palettes_are_read_like_eight():
 
 def test_a_texture_is_sampled_between_its_pixels_and_repeats():
     image = np.array([[0.1, 0.5], [0.3, 0.9]], dtype=np.float32)
-    at = [(0.25, 0.75), (0.75, 0.75), (0.25, 0.25), (0.5, 0.75), (0.5, 0.5), (1.25, -0.25), (0.0, 0.75)]
+    at = [
+        (0.25, 0.75),
+        (0.75, 0.75),
+        (0.25, 0.25),
+        (0.5, 0.75),
+        (0.5, 0.5),
+        (1.25, -0.25),
+        (0.0, 0.75),
+    ]
     u, v = np.array(at).T
     expected = [0.1, 0.5, 0.3, 0.3, 0.45, 0.1, 0.3]
     np.testing.assert_allclose(bilinear(image, u, v), expected, atol=1e-6)
@@ -81,7 +98,9 @@ def test_a_quad_has_the_colours_of_its_image(tmp_path):
     """Also where they lie: u runs to the right, and up in the image is up in v."""
     image = two_colours()
     image[:32, :32] = 255  # white above on the left
-    mesh = load_user_mesh(UserMesh("quad", str(write_quad(tmp_path, image)), rotation_deg=(0, 0, 0)))
+    mesh = load_user_mesh(
+        UserMesh("quad", str(write_quad(tmp_path, image)), rotation_deg=(0, 0, 0))
+    )
     points = [(0, -0.06, 0.03), (0, -0.02, -0.08), (0, 0.02, 0.03), (0, 0.09, -0.09)]
     np.testing.assert_allclose(luminance(mesh, points), [1, 0, LINEAR_GREY, LINEAR_GREY], atol=1e-6)
 
@@ -99,7 +118,9 @@ def test_a_glb_of_it_has_them_too(tmp_path):
     mesh = load_user_mesh(UserMesh("quad", str(tmp_path / "quad.glb")))
     assert mesh.paint is not None and len(mesh.paint.images) == 1
     seen = luminance(mesh, [(0, -0.05, 0.03), (0, 0.05, 0.03)])
-    np.testing.assert_allclose(seen, [0, 0.2 * LINEAR_GREY], atol=1e-6)  # the factor is linear, the image is not
+    np.testing.assert_allclose(
+        seen, [0, 0.2 * LINEAR_GREY], atol=1e-6
+    )  # the factor is linear, the image is not
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
@@ -119,9 +140,15 @@ def test_face_colours_and_material_colours(tmp_path):
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     corners = [[float(x) for x in line.split()[1:]] for line in QUAD.splitlines()]
     colours = np.array([[GREY, GREY, GREY, 255], [0, 255, 0, 255]], dtype=np.uint8)
-    trimesh.Trimesh(corners, faces, face_colors=colours, process=False).export(tmp_path / "faces.ply")
-    (tmp_path / "two.obj").write_text("mtllib two.mtl\n" + QUAD + "usemtl grey\nf 1 2 3\nusemtl green\nf 1 3 4\n")
-    (tmp_path / "two.mtl").write_text(f"newmtl grey\nKd {3 * f'{GREY / 255} '}\nnewmtl green\nKd 0 1 0\n")
+    trimesh.Trimesh(corners, faces, face_colors=colours, process=False).export(
+        tmp_path / "faces.ply"
+    )
+    (tmp_path / "two.obj").write_text(
+        "mtllib two.mtl\n" + QUAD + "usemtl grey\nf 1 2 3\nusemtl green\nf 1 3 4\n"
+    )
+    (tmp_path / "two.mtl").write_text(
+        f"newmtl grey\nKd {3 * f'{GREY / 255} '}\nnewmtl green\nKd 0 1 0\n"
+    )
     for name in ("faces.ply", "two.obj"):
         mesh = load_user_mesh(UserMesh("quad", str(tmp_path / name)))
         points = [(0, 0.06, -0.03), (0, -0.06, 0.03)]
@@ -130,7 +157,9 @@ def test_face_colours_and_material_colours(tmp_path):
 
 def test_meshes_without_colours_have_no_paint(tmp_path):
     (tmp_path / "plain.obj").write_text(QUAD + "f 1 2 3\nf 1 3 4\n")
-    (tmp_path / "places.obj").write_text(QUAD + "vt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/2\n")
+    (tmp_path / "places.obj").write_text(
+        QUAD + "vt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/2\n"
+    )
     for name in ("plain.obj", "places.obj"):
         assert load_user_mesh(UserMesh("quad", str(tmp_path / name))).paint is None
 
@@ -145,7 +174,9 @@ def light() -> Light:
 
 def photographed(path, light):
     """White frame (H, W) of a mesh in the first view, the studio and its trace."""
-    settings = BuildSettings(paper_rig(176), ("quad",), light=light, user_meshes=(UserMesh("quad", str(path)),))
+    settings = BuildSettings(
+        paper_rig(176), ("quad",), light=light, user_meshes=(UserMesh("quad", str(path)),)
+    )
     studio = Studio(settings)
     mesh = load_user_mesh(settings.user_meshes[0])
     scene = studio.trace(mesh, "A0")
@@ -162,23 +193,33 @@ def test_a_photograph_of_the_quad_has_both_albedos(tmp_path, light):
     half, whole = gains
     ratio = half[0] / whole[0]
     dark, bright = np.isclose(ratio, 0.02, rtol=1e-4), np.isclose(ratio, LINEAR_GREY, rtol=1e-4)
-    assert abs(dark.mean() - 0.5) < 0.05 and abs(bright.mean() - 0.5) < 0.05 and (dark | bright).mean() > 0.9
+    assert (
+        abs(dark.mean() - 0.5) < 0.05
+        and abs(bright.mean() - 0.5) < 0.05
+        and (dark | bright).mean() > 0.9
+    )
     on = (scene.mixed.triangle >= 0) & (whole[1] > 0)
-    mixed = half[1][on] / whole[1][on]  # some of these rays are between pixels, also of the repeated image
+    mixed = (
+        half[1][on] / whole[1][on]
+    )  # some of these rays are between pixels, also of the repeated image
     np.testing.assert_allclose([mixed.min(), mixed.max()], [0.02, LINEAR_GREY], rtol=1e-4)
 
 
 def test_without_textures_the_albedo_is_even(tmp_path):
     mesh = load_user_mesh(UserMesh("quad", str(write_quad(tmp_path, two_colours()))))
     surface = named_light("paper").changed("surface", textures="none").surface
-    assert material_of(mesh, np.zeros((1, 3)), np.zeros((1, 3)), surface, np.array([0])).albedo == 0.8
+    assert (
+        material_of(mesh, np.zeros((1, 3)), np.zeros((1, 3)), surface, np.array([0])).albedo == 0.8
+    )
 
 
 def test_triangles_without_an_area_do_not_shift_the_colours(tmp_path, light):
     """They are not traced, but count as rows of the faces."""
     text = write_quad(tmp_path, two_colours()).read_text()
     _, before = photographed(tmp_path / "quad.obj", light)
-    (tmp_path / "quad.obj").write_text(text.replace("usemtl paint\n", "usemtl paint\nf 1/1 1/1 2/2\nf 2/2 3/3 2/2\n"))
+    (tmp_path / "quad.obj").write_text(
+        text.replace("usemtl paint\n", "usemtl paint\nf 1/1 1/1 2/2\nf 2/2 3/3 2/2\n")
+    )
     _, after = photographed(tmp_path / "quad.obj", light)
     np.testing.assert_allclose(after.lit.gain, before.lit.gain, rtol=1e-5)
     assert after.hits.triangle.min() >= 0
@@ -190,7 +231,9 @@ def test_points_of_surfels_know_their_triangles(tmp_path):
     points = Surfels.of(mesh).points
     corners = mesh.vertices_m[mesh.faces[points.triangle]]
     weights = barycentric(corners, points.position_m)
-    np.testing.assert_allclose((weights[:, :, None] * corners).sum(axis=1), points.position_m, atol=1e-12)
+    np.testing.assert_allclose(
+        (weights[:, :, None] * corners).sum(axis=1), points.position_m, atol=1e-12
+    )
 
 
 def test_the_hash_covers_materials_and_textures(tmp_path):
@@ -207,16 +250,23 @@ def test_the_hash_covers_materials_and_textures(tmp_path):
     ("damage", "says"),
     [
         (lambda picture: picture.unlink(), "names the file 'quad.png', which is not beside it"),
-        (lambda picture: picture.write_bytes(picture.read_bytes()[:900]), "its texture 'quad.png' can't be read"),
         (
-            lambda picture: picture.with_name("quad.mtl").write_text("newmtl paint\nmap_Kd ../../elsewhere.png\n"),
+            lambda picture: picture.write_bytes(picture.read_bytes()[:900]),
+            "its texture 'quad.png' can't be read",
+        ),
+        (
+            lambda picture: picture.with_name("quad.mtl").write_text(
+                "newmtl paint\nmap_Kd ../../elsewhere.png\n"
+            ),
             "which is not beside it",
         ),
     ],
     ids=["missing", "cut", "outside"],
 )
 def test_damaged_textures_are_refused_in_words(tmp_path, damage, says):
-    path = write_quad(tmp_path, np.random.default_rng(1).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    path = write_quad(
+        tmp_path, np.random.default_rng(1).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    )
     damage(tmp_path / "quad.png")
     with pytest.raises(MeshError, match=says) as caught:
         load_user_mesh(UserMesh("quad", str(path)))
@@ -228,7 +278,10 @@ def test_changed_bytes_give_a_mesh_or_words(tmp_path, suffixes):
     loaded = trimesh.load(write_quad(tmp_path, two_colours(16)), force="mesh", process=False)
     loaded.export(tmp_path / "quad.glb")
     random, refused = np.random.default_rng(9), 0
-    originals = {tmp_path / f"quad.{suffix}": (tmp_path / f"quad.{suffix}").read_bytes() for suffix in suffixes}
+    originals = {
+        tmp_path / f"quad.{suffix}": (tmp_path / f"quad.{suffix}").read_bytes()
+        for suffix in suffixes
+    }
     for _ in range(60):
         for file, original in originals.items():
             content = bytearray(original)
@@ -260,9 +313,16 @@ def test_changed_bytes_give_a_mesh_or_words(tmp_path, suffixes):
 def test_what_a_mesh_names_must_be_a_regular_file(tmp_path, name, kind):
     path = write_quad(tmp_path, two_colours())
     (tmp_path / name).unlink()
-    makers = {"pipe": os.mkfifo, "device": lambda at: at.symlink_to("/dev/zero"), "folder": Path.mkdir}
+    makers = {
+        "pipe": os.mkfifo,
+        "device": lambda at: at.symlink_to("/dev/zero"),
+        "folder": Path.mkdir,
+    }
     makers[kind](tmp_path / name)
-    with pytest.raises(MeshError, match=rf"^{path}: names the file '{name}', which is not (a regular file|beside it)"):
+    with pytest.raises(
+        MeshError,
+        match=rf"^{path}: names the file '{name}', which is not (a regular file|beside it)",
+    ):
         load_user_mesh(UserMesh("quad", str(path)))
 
 
@@ -274,7 +334,9 @@ def test_textures_are_counted_by_their_headers_before_any_is_decoded(tmp_path):
         for kind, data in ((b"IHDR", header), (b"IDAT", b"x"))
     ]
     (tmp_path / "quad.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
-    with pytest.raises(MeshError, match=r"has textures of 134234112 px, expected 134217728; shrink them"):
+    with pytest.raises(
+        MeshError, match=r"has textures of 134234112 px, expected 134217728; shrink them"
+    ):
         load_user_mesh(UserMesh("quad", str(path)))
 
 
@@ -289,7 +351,9 @@ def test_a_mesh_without_end_is_refused_by_its_header(tmp_path):
     text += b" " * (-len(text) % 4)
     body = struct.pack("<II", len(text), 0x4E4F534A) + text + content[20 + length :]
     (tmp_path / "many.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
-    with pytest.raises(MeshError, match=r"many\.glb: has 20002 parts, expected at most 20000; join them"):
+    with pytest.raises(
+        MeshError, match=r"many\.glb: has 20002 parts, expected at most 20000; join them"
+    ):
         load_user_mesh(UserMesh("many", str(tmp_path / "many.glb")))
 
 

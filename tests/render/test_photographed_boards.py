@@ -1,4 +1,5 @@
-"""Photographed boards: where the print's edges are, poses that fit, and captures on disk that can be continued."""
+"""Photographed boards: where the print's edges are, poses that fit, and captures on disk that can
+be continued."""
 
 import json
 from dataclasses import replace
@@ -30,7 +31,9 @@ from fpp_ml_bench.optics.sequence import Sequence
 RIG = replace(paper_rig(240), sequence=Sequence(steps=3))
 BENT = replace(RIG, camera=replace(RIG.camera, distortion=(-0.3, 0.1, 0.004, -0.003, 0.0)))
 BOARD = fitting_board(RIG)
-TILTED = BoardPose(tuple(map(tuple, cv2.Rodrigues(np.array([0.3, -0.35, 0.2]))[0])), (-0.08, -0.16, 1.7))
+TILTED = BoardPose(
+    tuple(map(tuple, cv2.Rodrigues(np.array([0.3, -0.35, 0.2]))[0])), (-0.08, -0.16, 1.7)
+)
 
 
 def radiance(rig, board, pose):
@@ -55,24 +58,37 @@ def by_opencv(rig, pose, points_mm):
 @pytest.mark.parametrize("rig", [RIG, BENT], ids=["straight", "bent"])
 @pytest.mark.parametrize("kind", ["circles", "circles-asymmetric"])
 def test_circles_have_their_centroid_where_opencv_projects_their_outline(rig, kind):
-    board = Board("circles", 5, 9, 50.0, 15.0) if kind == "circles" else Board(kind, 3, 9, 40.0, 15.0)
+    board = (
+        Board("circles", 5, 9, 50.0, 15.0) if kind == "circles" else Board(kind, 3, 9, 40.0, 15.0)
+    )
     image = radiance(rig, board, TILTED)
     errors = []
     y, x = np.mgrid[: rig.camera.height, : rig.camera.width]
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     for centre in board.points_mm():
-        outline = centre + board.radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+        outline = centre + board.radius_mm * np.stack(
+            [np.cos(angle), np.sin(angle), 0 * angle], axis=-1
+        )
         outline = by_opencv(rig, TILTED, outline)
         moments = cv2.moments((256 * (outline - outline[0])).astype(np.float32))
         expected = np.array([moments["m10"], moments["m01"]]) / moments["m00"] / 256 + outline[0]
         away = np.hypot(x - expected[0], y - expected[1])
         near, ring = away < 7.0, (away > 6.0) & (away < 7.5)
         design = np.stack([x, y, np.ones_like(x)], axis=-1).astype(float)
-        white = design @ np.linalg.lstsq(design[ring], image[ring], rcond=None)[0]  # the light varies over the board
+        white = (
+            design @ np.linalg.lstsq(design[ring], image[ring], rcond=None)[0]
+        )  # the light varies over the board
         dark = np.where(near, 1 - image / white, 0.0)
-        errors.append([(dark * x).sum() / dark.sum() - expected[0], (dark * y).sum() / dark.sum() - expected[1]])
+        errors.append(
+            [
+                (dark * x).sum() / dark.sum() - expected[0],
+                (dark * y).sum() / dark.sum() - expected[1],
+            ]
+        )
         area = cv2.contourArea(outline.astype(np.float32))
-        assert dark.sum() / (1 - DARK) == pytest.approx(area, rel=0.04)  # ambient light is dark on the print too
+        assert dark.sum() / (1 - DARK) == pytest.approx(
+            area, rel=0.04
+        )  # ambient light is dark on the print too
     assert np.sqrt(np.mean(np.square(errors))) < 0.003 and np.abs(errors).max() < 0.01
 
 
@@ -83,13 +99,21 @@ def test_the_corners_of_a_checker_are_where_opencv_projects_them():
     expected = by_opencv(rig, TILTED, board.points_mm())
     nearest = np.abs(found[:, None] - expected).sum(-1).argmin(axis=1)
     assert len(set(nearest)) == 63
-    error = found - expected[nearest]  # on a picture supersampled 16 times the finder itself has 0.047 px RMS
+    error = (
+        found - expected[nearest]
+    )  # on a picture supersampled 16 times the finder itself has 0.047 px RMS
     assert np.sqrt(np.mean(error**2)) < 0.06 and np.abs(error.mean(axis=0)).max() < 0.02
 
 
 def test_the_boards_of_the_papers_rig():
     assert len(board_poses(paper_rig(), PAPER_BOARD)) == 18
-    assert (BOARD.kind, BOARD.columns, BOARD.rows, BOARD.spacing_mm, BOARD.radius_mm) == ("circles", 5, 9, 50.0, 15.0)
+    assert (BOARD.kind, BOARD.columns, BOARD.rows, BOARD.spacing_mm, BOARD.radius_mm) == (
+        "circles",
+        5,
+        9,
+        50.0,
+        15.0,
+    )
     assert fitting_board(paper_rig(), "checker", 7, 9).radius_mm == 0
 
 
@@ -97,19 +121,31 @@ def test_the_boards_of_the_papers_rig():
 def test_poses_fit_and_are_spread(rig):
     poses = board_poses(rig, BOARD)
     (left, top), (right, bottom) = sheet_corners_mm(BOARD)
-    corners_m = np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]]) / 1000
+    corners_m = (
+        np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]]) / 1000
+    )
     normals, middles = [], []
     for pose in poses:
         rotation = np.array(pose.rotation)
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
         placed = corners_m @ rotation.T + pose.translation_m
         assert placed[:, 2].min() >= 1.5 - 1e-9 and placed[:, 2].max() <= 2.1 + 1e-9
-        for device, (u, v) in ((rig.camera, rig.camera.project(placed)), (rig.projector, rig.project(placed))):
-            assert u.min() > 0 and v.min() > 0 and u.max() < device.width - 1 and v.max() < device.height - 1
+        for device, (u, v) in (
+            (rig.camera, rig.camera.project(placed)),
+            (rig.projector, rig.project(placed)),
+        ):
+            assert (
+                u.min() > 0
+                and v.min() > 0
+                and u.max() < device.width - 1
+                and v.max() < device.height - 1
+            )
         normals.append(rotation[:, 2])
         u, v = rig.camera.project(placed.mean(axis=0))
         middles.append((u / rig.camera.width, v / rig.camera.height, placed[:, 2].mean()))
-    assert len(poses) == 18 and min(normal[2] for normal in normals) >= np.cos(np.radians(30)) - 1e-9
+    assert (
+        len(poses) == 18 and min(normal[2] for normal in normals) >= np.cos(np.radians(30)) - 1e-9
+    )
     tilted = np.array(normals)[:, :2]
     assert (np.ptp(tilted, axis=0) > 0.6).all()  # both ways about both axes
     assert (np.ptp(middles, axis=0) > [0.3, 0.3, 0.3]).all()
@@ -119,7 +155,11 @@ def test_poses_fit_and_are_spread(rig):
 def test_a_board_that_does_not_fit_or_can_not_be_printed():
     with pytest.raises(CalibrationError, match=r"does not fit .* circles:5x9:50 would suit"):
         board_poses(RIG, Board("circles", 5, 9, 90.0, 20.0))
-    for board in (Board("circles", 5, 9, 50.0), Board("circles", 5, 9, 50.0, 30.0), Board("charuco", 5, 7, 40.0, 30.0)):
+    for board in (
+        Board("circles", 5, 9, 50.0),
+        Board("circles", 5, 9, 50.0, 30.0),
+        Board("charuco", 5, 7, 40.0, 30.0),
+    ):
         with pytest.raises(CalibrationError, match=r"radius below half|charuco"):
             board_studio(RIG, board)
 

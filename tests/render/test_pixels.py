@@ -1,4 +1,5 @@
-"""Pixels with an area: which mix surfaces, in which shares, and what they see; the lens's blur and vignetting."""
+"""Pixels with an area: which mix surfaces, in which shares, and what they see; the lens's blur and
+vignetting."""
 
 from dataclasses import replace
 
@@ -18,8 +19,11 @@ WHITE = RIG.sequence.white
 
 
 def plate(left_px, right_px, top_px=20.0, bottom_px=150.0, z_m=1.8):
-    """A sheet square to the axis that covers pixel edges ``left_px`` to ``right_px`` of the image."""
-    x0, x1, y0, y1 = ((edge - MIDDLE_PX) / FOCAL_PX * z_m for edge in (left_px, right_px, top_px, bottom_px))
+    """A sheet square to the axis that covers pixel edges ``left_px`` to ``right_px`` of the
+    image."""
+    x0, x1, y0, y1 = (
+        (edge - MIDDLE_PX) / FOCAL_PX * z_m for edge in (left_px, right_px, top_px, bottom_px)
+    )
     return [x0, y0, z_m], [x1 - x0, 0, 0], [0, y1 - y0, 0]
 
 
@@ -38,7 +42,8 @@ def image_of(pixels, values, rest=0.0):
 
 @pytest.mark.parametrize(("across", "quarters"), [(2, 2), (4, 1), (4, 3)])
 def test_a_pixel_that_is_partly_covered(across, quarters):
-    """The left edge of a sheet runs ``quarters`` quarters from the right side of the pixels of column 60."""
+    """The left edge of a sheet runs ``quarters`` quarters from the right side of the pixels of
+    column 60."""
     hits, found = mixed(plate(60.5 - quarters / 4 + 0.01, 120.49, 20.51, 150.49), across=across)
     cover = image_of(found.pixels, (found.triangle >= 0).reshape(-1, across**2).mean(axis=1))
     assert (cover[21:151, 60] == quarters / 4).all()
@@ -60,7 +65,8 @@ def test_a_half_covered_pixel_has_the_mean_light():
     rows = slice(65, 110)
     left, here, right = frame[rows, 59], frame[rows, 60], frame[rows, 61]
     assert (right - left).min() > 60
-    # The neighbours are a pixel away, over which light changes by less than 0.2 grey levels; each is rounded.
+    # The neighbours are a pixel away, over which light changes by less than 0.2 grey levels; each
+    # is rounded.
     assert np.abs(here - (left + right) / 2).max() <= 1.3
     assert abs((here - (left + right) / 2).mean()) < 0.3
     assert (cover[rows, 60] == 128).all() and (cover[rows, [59]] == 255).all()
@@ -71,7 +77,9 @@ def test_a_half_covered_pixel_has_the_mean_light():
 def test_a_tilted_plane_mixes_nothing():
     for slope in (0.0, 0.5, 2.0):
         rays = np.array([[-0.3, -0.3, 1], [0.3, -0.3, 1], [0.3, 0.3, 1], [-0.3, 0.3, 1]])
-        vertices = rays * (1.8 / (1 - slope * rays[:, :1]))  # z = 1.8 + slope x, beyond the image all around
+        vertices = rays * (
+            1.8 / (1 - slope * rays[:, :1])
+        )  # z = 1.8 + slope x, beyond the image all around
         mesh = replace(sheet(plate(0, 1)), vertices_m=vertices)
         traced = TracedObject(mesh, vertices)
         hits = traced.primary(PixelRays.of(RIG.camera))
@@ -81,7 +89,10 @@ def test_a_tilted_plane_mixes_nothing():
 
 def test_a_step_mixes_from_two_millimetres_on():
     for step_mm, found_px in ((1.9, 0), (2.1, 100)):
-        near, far = plate(40.49, 90.2, 30.51, 130.49, 1.8), plate(80.0, 140.49, 30.51, 130.49, 1.8 + step_mm / 1000)
+        near, far = (
+            plate(40.49, 90.2, 30.51, 130.49, 1.8),
+            plate(80.0, 140.49, 30.51, 130.49, 1.8 + step_mm / 1000),
+        )
         _, found = mixed(near, far, across=4)
         assert found.void.sum() == found_px
         assert (found.pixels % 176 == 90).all() and (found.triangle >= 0).all()
@@ -89,7 +100,11 @@ def test_a_step_mixes_from_two_millimetres_on():
 
 def test_an_edge_mixes_light_but_not_depth():
     """Two sides of a ridge meet at an angle: pixels across the edge see both, and it is no void."""
-    mesh = solid(trimesh.creation.box((0.2, 0.2, 0.2), trimesh.transformations.rotation_matrix(np.pi / 4, [0, 1, 0])))
+    mesh = solid(
+        trimesh.creation.box(
+            (0.2, 0.2, 0.2), trimesh.transformations.rotation_matrix(np.pi / 4, [0, 1, 0])
+        )
+    )
     vertices = np.add(mesh.vertices_m, [0.0011, 0.0, 1.8])
     traced = TracedObject(mesh, vertices)
     hits = traced.primary(PixelRays.of(RIG.camera))
@@ -100,7 +115,9 @@ def test_an_edge_mixes_light_but_not_depth():
     # Of these pixels' rays some see the left side, some the right, and all are on the object.
     of = np.isin(found.pixels, middle[ridge])
     normals = found.normals.reshape(-1, 16, 3)[of]
-    assert (normals[:, :, 0].min(axis=1) < -0.7).all() and (normals[:, :, 0].max(axis=1) > 0.7).all()
+    assert (normals[:, :, 0].min(axis=1) < -0.7).all() and (
+        normals[:, :, 0].max(axis=1) > 0.7
+    ).all()
     assert (found.share[of] == 1).all()
 
 

@@ -1,4 +1,5 @@
-"""Ray casting against closed forms and against a second ray caster, Moeller-Trumbore over every ray and triangle."""
+"""Ray casting against closed forms and against a second ray caster, Moeller-Trumbore over every ray
+and triangle."""
 
 from dataclasses import replace
 
@@ -33,7 +34,8 @@ def depth_image(hits):
 
 
 def brute_force(mesh_vertices, faces, rays=RAYS):
-    """Depth image by Moeller-Trumbore over every ray and triangle in double precision; 0 = nothing."""
+    """Depth image by Moeller-Trumbore over every ray and triangle in double precision; 0 =
+    nothing."""
     directions = np.column_stack([rays.x.ravel(), rays.y.ravel(), np.ones(rays.x.size)])
     best = np.full(rays.x.size, np.inf)
     for a, b, c in np.asarray(mesh_vertices, dtype=float)[faces]:
@@ -54,7 +56,9 @@ def brute_force(mesh_vertices, faces, rays=RAYS):
 SHAPES = {
     "icosphere": trimesh.creation.icosphere(2, 0.15),
     "torus": trimesh.creation.torus(0.1, 0.04, 16, 10),
-    "box turned": trimesh.creation.box((0.2, 0.1, 0.25), trimesh.transformations.euler_matrix(0.4, 0.3, 0.2)),
+    "box turned": trimesh.creation.box(
+        (0.2, 0.1, 0.25), trimesh.transformations.euler_matrix(0.4, 0.3, 0.2)
+    ),
     "two bodies": trimesh.util.concatenate(
         [
             trimesh.creation.box((0.1, 0.1, 0.1)),
@@ -90,14 +94,18 @@ def test_rays_of_a_camera_with_lens_distortion():
 
 
 def test_slivers_and_large_triangles():
-    """Long thin triangles at every angle: the columns of a row that they cover are computed, and none is missed."""
+    """Long thin triangles at every angle: the columns of a row that they cover are computed, and
+    none is missed."""
     rng = np.random.default_rng(4)
     start = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), rng.uniform(1.5, 2.1, 200)])
     end = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), rng.uniform(1.5, 2.1, 200)])
     aside = start + rng.normal(0, 1, (200, 3)) * 10.0 ** rng.uniform(-5, -1, (200, 1))
     vertices_m = np.concatenate([start, end, aside])
     faces = np.column_stack([np.arange(200), np.arange(200) + 200, np.arange(200) + 400])
-    depth_m, expected = depth_image(traced(vertices_m, faces).primary(RAYS)), brute_force(vertices_m, faces)
+    depth_m, expected = (
+        depth_image(traced(vertices_m, faces).primary(RAYS)),
+        brute_force(vertices_m, faces),
+    )
     np.testing.assert_array_equal(depth_m > 0, expected > 0)
     np.testing.assert_allclose(depth_m, expected, atol=1e-9)
 
@@ -111,7 +119,9 @@ def test_no_ray_passes_between_neighbours():
     corner = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()
     faces = np.concatenate([corner[:, None] + [0, 1, 12], corner[:, None] + [0, 12, 11]])
     seen = depth_image(traced(vertices_m, faces).primary(RAYS)) > 0
-    inside = (np.abs(X - X[0, 88]) < lines[-1] - X[0, 88] - 1e-9) & (np.abs(Y - X[0, 88]) < lines[-1] - X[0, 88] - 1e-9)
+    inside = (np.abs(X - X[0, 88]) < lines[-1] - X[0, 88] - 1e-9) & (
+        np.abs(Y - X[0, 88]) < lines[-1] - X[0, 88] - 1e-9
+    )
     assert inside.sum() > 70 * 70
     assert seen[inside].all()
 
@@ -121,7 +131,9 @@ def test_a_tilted_plane():
     square[:, 2] += square[:, :2] @ [0.3, -0.2]
     normal = np.array([0.3, -0.2, -1.0])
     hits = traced(square, [[0, 1, 2], [0, 2, 3]]).primary(RAYS)
-    np.testing.assert_allclose(depth_image(hits), 2.0 / (1 - 0.3 * X + 0.2 * Y), atol=1e-9)  # z = 2 + 0.3 x z - 0.2 y z
+    np.testing.assert_allclose(
+        depth_image(hits), 2.0 / (1 - 0.3 * X + 0.2 * Y), atol=1e-9
+    )  # z = 2 + 0.3 x z - 0.2 y z
     np.testing.assert_allclose(hits.normals, [normal / np.linalg.norm(normal)] * X.size, atol=1e-9)
 
 
@@ -140,16 +152,21 @@ def test_flipped_winding_changes_nothing():
 
 
 def test_edge_on_and_degenerate_triangles():
-    """A sheet seen exactly edge-on gives finite depths of its own, and triangles without area are not there."""
+    """A sheet seen exactly edge-on gives finite depths of its own, and triangles without area are
+    not there."""
     size = RIG.camera.width
     assert size % 2 == 0
     x0 = X[0, size // 2]  # a plane through the camera that holds a whole column of rays
-    sheet = np.array([[1.7 * x0, -0.1, 1.7], [1.9 * x0, -0.1, 1.9], [1.9 * x0, 0.1, 1.9], [1.7 * x0, 0.1, 1.7]])
+    sheet = np.array(
+        [[1.7 * x0, -0.1, 1.7], [1.9 * x0, -0.1, 1.9], [1.9 * x0, 0.1, 1.9], [1.7 * x0, 0.1, 1.7]]
+    )
     hits = traced(sheet, [[0, 1, 2], [0, 2, 3]]).primary(RAYS)
     assert np.isfinite(hits.depth_m).all() and np.isfinite(hits.normals).all()
     assert ((hits.depth_m >= 1.7 - 1e-9) & (hits.depth_m <= 1.9 + 1e-9)).all()
     mesh = SHAPES["icosphere"]
-    vertices = np.vstack([np.add(mesh.vertices, [0, 0, 1.8]), [[0, 0, 1.55], [0, 0, 1.55], [0, 0, 1.6]]])
+    vertices = np.vstack(
+        [np.add(mesh.vertices, [0, 0, 1.8]), [[0, 0, 1.55], [0, 0, 1.55], [0, 0, 1.6]]]
+    )
     n = len(mesh.vertices)
     degenerate = np.vstack([[[n, n + 1, n + 2], [n, n, n], [0, 0, 1]], mesh.faces])
     plain = traced_mesh(mesh).primary(RAYS)
@@ -201,7 +218,9 @@ def test_where_a_line_first_meets_the_object(name):
     point = (starts + along[:, None] * way)[triangle >= 0]
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1)
-    parts = sum(np.linalg.norm(np.cross(q - p, point - p), axis=1) for p, q in ((a, b), (b, c), (c, a)))
+    parts = sum(
+        np.linalg.norm(np.cross(q - p, point - p), axis=1) for p, q in ((a, b), (b, c), (c, a))
+    )
     np.testing.assert_allclose(parts, area, rtol=1e-6)
     # Any hit is a hit of some triangle, where there is one.
     some = obj.met(starts, ends, any_suffices=True)
@@ -218,7 +237,10 @@ def test_a_surface_does_not_shadow_itself():
     mesh = trimesh.creation.icosphere(4, 0.15)
     sphere = traced_mesh(mesh)
     hits = sphere.primary(RAYS)
-    points = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)])[hits.pixels] * hits.depth_m[:, None]
+    points = (
+        np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)])[hits.pixels]
+        * hits.depth_m[:, None]
+    )
     light = np.array([-0.125, 0.1, 0.0])
     toward = light - points
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)

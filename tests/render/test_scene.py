@@ -1,4 +1,5 @@
-"""Where objects stand: turning direction, axes, placement within the range and the image, and the scale of a misfit."""
+"""Where objects stand: turning direction, axes, placement within the range and the image, and the
+scale of a misfit."""
 
 import re
 
@@ -26,7 +27,8 @@ def box(*extents_m):
 
 
 def test_turning_is_rz_in_the_papers_world_frame():
-    """The simulator's frame: Z up, camera at (-1.2, -0.125, 1.5) looking along +X, object about (0.6, -0.125, 1.5)."""
+    """The simulator's frame: Z up, camera at (-1.2, -0.125, 1.5) looking along +X, object about
+    (0.6, -0.125, 1.5)."""
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (40, 3))
     mesh = SolidMesh("points", points, np.array([[0, 1, 2]], dtype=np.int32))
     forward, up = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
@@ -41,7 +43,8 @@ def test_turning_is_rz_in_the_papers_world_frame():
 
 
 def inside(vertices_m, rig):
-    """Whether all vertices lie in the working range and project into the image, by the rig's own projection."""
+    """Whether all vertices lie in the working range and project into the image, by the rig's own
+    projection."""
     u, v = rig.camera.project(vertices_m)
     near, far = rig.working_range_mm
     z = 1000 * vertices_m[:, 2]
@@ -75,7 +78,9 @@ def test_bounds_are_tight():
     for degrees in VIEW_DEGREES:
         about = turned(mesh.vertices_m, degrees)
         near_m, far_m = distance_bounds_m(about, RIG)
-        assert inside(np.add(about, [0, 0, near_m]), RIG) and inside(np.add(about, [0, 0, far_m]), RIG)
+        assert inside(np.add(about, [0, 0, near_m]), RIG) and inside(
+            np.add(about, [0, 0, far_m]), RIG
+        )
         assert not inside(np.add(about, [0, 0, far_m + 0.001]), RIG)
         # Two image px of margin are kept, which 1 mm does not use up: 25 mm at the near end does.
         assert not inside(np.add(about, [0, 0, near_m - 0.06]), RIG)
@@ -90,7 +95,9 @@ def test_placement_depends_on_seed_object_and_view_alone():
 
 
 @pytest.mark.parametrize("rule", ["fixed", "varied"])
-@pytest.mark.parametrize("extents", [(3.0, 0.1, 0.1), (0.2, 0.2, 2.0), (0.7, 0.1, 0.1), (50.0, 20.0, 90.0)])
+@pytest.mark.parametrize(
+    "extents", [(3.0, 0.1, 0.1), (0.2, 0.2, 2.0), (0.7, 0.1, 0.1), (50.0, 20.0, 90.0)]
+)
 def test_a_misfit_names_a_scale_that_fits_in_every_view(rule, extents):
     mesh = box(*extents)
     misfits = []
@@ -123,7 +130,9 @@ def test_modulation_is_half_of_white_by_the_inverse_square():
     assert modulation_at(RIG, 2100.0) == pytest.approx(90 * (1.5 / 2.1) ** 2)
     dim = named_light("paper").changed("camera", reference_grey=100.0)
     assert modulation_at(RIG, 3000.0, dim) == pytest.approx(12.5)
-    assert modulation_at(RIG, 3000.0, dim.changed("camera", exposure=(0.5, 2.0))) == pytest.approx(6.25)
+    assert modulation_at(RIG, 3000.0, dim.changed("camera", exposure=(0.5, 2.0))) == pytest.approx(
+        6.25
+    )
 
 
 # ---- calibration
@@ -131,15 +140,24 @@ def test_modulation_is_half_of_white_by_the_inverse_square():
 
 @pytest.mark.parametrize("calibration_px", [0.05, 2.0, 20.0])
 def test_calibration_error_has_the_size_asked_for(calibration_px):
-    """RMS distance of where the two rigs put points at both ends of the working range, of every pixel."""
+    """RMS distance of where the two rigs put points at both ends of the working range, of every
+    pixel."""
     x, y = (axis.ravel() for axis in RIG.camera.rays())
-    points = np.concatenate([np.column_stack([x, y, np.ones_like(x)]) * distance_m for distance_m in (1.5, 2.1)])
+    points = np.concatenate(
+        [np.column_stack([x, y, np.ones_like(x)]) * distance_m for distance_m in (1.5, 2.1)]
+    )
     other = photographing_rig(RIG, calibration_px, 42)
     (u, v), (u2, v2) = RIG.project(points), other.project(points)
-    assert np.sqrt(np.mean((u - u2) ** 2 + (v - v2) ** 2)) == pytest.approx(calibration_px, rel=0.01)
+    assert np.sqrt(np.mean((u - u2) ** 2 + (v - v2) ** 2)) == pytest.approx(
+        calibration_px, rel=0.01
+    )
     np.testing.assert_allclose(other.R @ other.R.T, np.eye(3), atol=1e-12)
     assert other.camera == RIG.camera and other.sequence == RIG.sequence
-    assert photographing_rig(RIG, calibration_px, 1) == photographing_rig(RIG, calibration_px, 1) != other
+    assert (
+        photographing_rig(RIG, calibration_px, 1)
+        == photographing_rig(RIG, calibration_px, 1)
+        != other
+    )
     assert photographing_rig(RIG, 0.0, 1) is RIG
 
 
@@ -155,4 +173,6 @@ def test_calibration_error_has_the_size_asked_for(calibration_px):
 def test_a_misfit_by_another_unit_names_the_scale(extents, said):
     with pytest.raises(MeshError) as caught:
         place(solid(trimesh.creation.box(extents)), "A0", RIG, "fixed", 0)
-    assert said in str(caught.value) and ("if its numbers are no metres" in str(caught.value)) == bool(said)
+    assert said in str(caught.value) and (
+        "if its numbers are no metres" in str(caught.value)
+    ) == bool(said)

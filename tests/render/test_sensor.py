@@ -1,7 +1,9 @@
-"""The sensor: is its noise normal, independent and of the right size, and are its bytes those of a plain evaluation?
+"""The sensor: is its noise normal, independent and of the right size, and are its bytes those of a
+plain evaluation?
 
-Seeds are fixed, so every p-value below is a constant of this code. With these thresholds a good generator passes for
-nearly any seed and a poor generator fails. References: scipy.stats and NumPy's generator.
+Seeds are fixed, so every p-value below is a constant of this code. With these thresholds a good
+generator passes for nearly any seed and a poor generator fails. References: scipy.stats and NumPy's
+generator.
 """
 
 from dataclasses import replace
@@ -52,7 +54,8 @@ def test_distribution_is_normal(frames, name):
     z = frames[name]
     assert stats.kstest(z, "norm").pvalue > 1e-3
     assert stats.cramervonmises(z[:200_000], "norm").pvalue > 1e-3
-    # Anderson-Darling weighs the tails; with known mean and variance its 0.1% point is 6.0 (Stephens 1974).
+    # Anderson-Darling weighs the tails; with known mean and variance its 0.1% point is 6.0
+    # (Stephens 1974).
     u = np.sort(stats.norm.cdf(z))
     i = np.arange(1, u.size + 1)
     a2 = -u.size - np.mean((2 * i - 1) * (np.log(u) + np.log1p(-u[::-1])))
@@ -69,7 +72,8 @@ def test_tails_hold_as_many_pixels_as_they_should():
 def test_largest_deviate_is_as_documented():
     assert float(2 * normal_table().max()) == pytest.approx(5.2, abs=0.1)
     table = normal_table().astype(np.float64)
-    # Each entry is rounded once to float32, by 2**-24 of itself at most; a square has twice the relative error.
+    # Each entry is rounded once to float32, by 2**-24 of itself at most; a square has twice the
+    # relative error.
     assert table.mean() == pytest.approx(0, abs=2**-24 * np.abs(table).mean())
     assert (table**2).mean() == pytest.approx(0.5, rel=2**-22)
     with pytest.raises(ValueError, match="read-only"):
@@ -87,7 +91,8 @@ def test_pixels_are_independent_of_their_neighbours(frames, lag):
 
 
 @pytest.mark.parametrize(
-    "other", [(42, "mug", "A0", 1), (42, "mug", "A60", 0), (42, "bowl", "A0", 0), (43, "mug", "A0", 0)]
+    "other",
+    [(42, "mug", "A0", 1), (42, "mug", "A60", 0), (42, "bowl", "A0", 0), (43, "mug", "A0", 0)],
 )
 def test_frames_views_objects_and_seeds_are_independent(frames, other):
     a, b = frames[STREAMS[0]], deviates(*other)
@@ -99,7 +104,9 @@ def test_frames_views_objects_and_seeds_are_independent(frames, other):
 def test_names_are_told_apart_where_they_are_joined():
     assert not np.array_equal(stream_keys(1, "a", "bc"), stream_keys(1, "ab", "c"))
     assert not np.array_equal(stream_keys(1, 23), stream_keys(12, 3))
-    keys = {stream_keys(42, "mug", f"A{a}", f).tobytes() for a in range(0, 360, 60) for f in range(52)}
+    keys = {
+        stream_keys(42, "mug", f"A{a}", f).tobytes() for a in range(0, 360, 60) for f in range(52)
+    }
     assert len(keys) == 312
 
 
@@ -133,15 +140,22 @@ def exposure_of(rig=None, projector=None, **camera):
 WHITE = RIG.sequence.white
 
 
-@pytest.mark.parametrize(("full_well_e", "read_noise_e", "black_grey"), [(4000.0, 40.0, 10.0), (10500.0, 60.0, 8.0)])
-def test_photon_transfer_curve_gives_gain_and_read_noise_back(full_well_e, read_noise_e, black_grey):
-    """EMVA 1288: temporal variance over mean is a line whose slope is the gain, and whose end is the read noise. Its
-    quantisation adds 1/12."""
-    exposure = exposure_of(full_well_e=full_well_e, read_noise_e=read_noise_e, black_grey=black_grey)
+@pytest.mark.parametrize(
+    ("full_well_e", "read_noise_e", "black_grey"), [(4000.0, 40.0, 10.0), (10500.0, 60.0, 8.0)]
+)
+def test_photon_transfer_curve_gives_gain_and_read_noise_back(
+    full_well_e, read_noise_e, black_grey
+):
+    """EMVA 1288: temporal variance over mean is a line whose slope is the gain, and whose end is
+    the read noise. Its quantisation adds 1/12."""
+    exposure = exposure_of(
+        full_well_e=full_well_e, read_noise_e=read_noise_e, black_grey=black_grey
+    )
     means, variances = [], []
     for level in np.linspace(30, 190, 9) + 0.37:
         first, second = (
-            exposure.expose([WHITE], flat(level), PIXELS, (seed, "flat", level))[0].astype(float) for seed in (1, 2)
+            exposure.expose([WHITE], flat(level), PIXELS, (seed, "flat", level))[0].astype(float)
+            for seed in (1, 2)
         )
         means.append((first.mean() + second.mean()) / 2)
         variances.append(((first - second) ** 2).mean() / 2)  # without what the two have in common
@@ -181,29 +195,42 @@ def test_converter_and_response_against_a_direct_evaluation(bits, response):
     black_grey, most = 4.25, 2**bits - 1
     light = RAMP.astype(np.float64) + black_grey
     code = np.floor(light / 255 * most + 0.5).clip(0, most) / most
-    curve = code**response if not isinstance(response, tuple) else np.interp(code, [0, 1 / 3, 2 / 3, 1], response)
+    curve = (
+        code**response
+        if not isinstance(response, tuple)
+        else np.interp(code, [0, 1 / 3, 2 / 3, 1], response)
+    )
     read = ramp_bytes(bits=bits, response=response, black_grey=black_grey)
     assert read.dtype == np.uint8
     off = read != np.floor(255 * curve + 0.5)
-    # Light within float32's rounding of the middle between two codes may go to either: a step further at most.
+    # Light within float32's rounding of the middle between two codes may go to either: a step
+    # further at most.
     assert off.mean() < 1e-3
     steepest = np.ceil(255 * np.abs(np.diff(np.unique(curve))).max())
     assert np.abs(read.astype(float) - 255 * curve)[off].max(initial=0) <= steepest + 0.5
 
 
 def test_quantisation_rounds_and_clips_at_the_ends():
-    np.testing.assert_array_equal(ramp_bytes(), np.floor(RAMP.astype(np.float64) + 0.5).clip(0, 255))
+    np.testing.assert_array_equal(
+        ramp_bytes(), np.floor(RAMP.astype(np.float64) + 0.5).clip(0, 255)
+    )
 
 
 @pytest.mark.parametrize("bits", [8, 10])
 def test_bounces_take_no_light_away(bits):
-    """Those of a response that is no line come without its higher harmonics, and can be below 0: then the square root
-    of the noise is none, and a code that is not a number would be looked up beside its table."""
+    """Those of a response that is no line come without its higher harmonics, and can be below 0:
+    then the square root of the noise is none, and a code that is not a number would be looked up
+    beside its table."""
     exposure = exposure_of(bits=bits, full_well_e=23000.0, read_noise_e=12.0, black_grey=9.0)
-    dark, taken = flat(0.0), replace(flat(0.0), bounced=np.full((52, PIXELS.size), -13.0, np.float32))
+    dark, taken = (
+        flat(0.0),
+        replace(flat(0.0), bounced=np.full((52, PIXELS.size), -13.0, np.float32)),
+    )
     frames = [exposure.expose([WHITE], lit, PIXELS, (1, "flat"))[0] for lit in (dark, taken)]
     assert (frames[0] == frames[1]).all() and frames[0].mean() == pytest.approx(9, abs=0.1)
-    lit = replace(flat(0.0, 3), ambient=np.full(3, 20, np.float32), bounced=np.full((52, 3), -13, np.float32))
+    lit = replace(
+        flat(0.0, 3), ambient=np.full(3, 20, np.float32), bounced=np.full((52, 3), -13, np.float32)
+    )
     assert (exposure.radiance([WHITE], lit, (1, "flat"), np.empty((1, 3), np.float32)) == 7).all()
 
 
@@ -216,7 +243,9 @@ def test_flicker_is_one_factor_a_frame_and_normal():
     lamps = []
     for view in range(40):
         lit = replace(
-            flat(2e3, 3), ambient=np.full(3, 7.0, dtype=np.float32), bounced=np.full((52, 3), 1e3, np.float32)
+            flat(2e3, 3),
+            ambient=np.full(3, 7.0, dtype=np.float32),
+            bounced=np.full((52, 3), 1e3, np.float32),
         )
         light = exposure.radiance(range(52), lit, (1, "flat", view), np.empty((52, 3), np.float32))
         assert (light == light[:, :1]).all()  # the same for every pixel
@@ -251,7 +280,8 @@ def exposure_under(name):
 
 
 def randomly_lit(exposure, light, n=211 * 173):
-    """Random projector coordinates, gains, ambient and bounced light of n points (211 x 173: no round numbers)."""
+    """Random projector coordinates, gains, ambient and bounced light of n points (211 x 173: no
+    round numbers)."""
     rng = np.random.default_rng(5)
     u, v = rng.uniform(-30, 941, n), rng.uniform(-30, 1169, n)
     place = exposure.pattern.place(u, v, rng.uniform(1.5, 3.2, n), SMALL, light.projector)
@@ -276,7 +306,11 @@ def in_numpy(exposure, frames, lit, pixels, stream):
     samples = lit.gain.size // pixels.size
     for frame in frames:
         profiles = exposure.pattern.table[frame]
-        index, weight = (p.u_index, p.u_weight) if exposure.pattern.along[frame] == ALONG_U else (p.v_index, p.v_weight)
+        index, weight = (
+            (p.u_index, p.u_weight)
+            if exposure.pattern.along[frame] == ALONG_U
+            else (p.v_index, p.v_weight)
+        )
         low, high = profiles[0][index], profiles[0][index.astype(int) + 1]
         if len(profiles) > 1:
             share, level = p.level_weight, p.level.astype(int)
@@ -287,7 +321,8 @@ def in_numpy(exposure, frames, lit, pixels, stream):
         lamp = f(1)
         if exposure.flicker:
             lamp += (
-                f(exposure.flicker) * standard_normal(np.zeros(1, np.uint32), stream_keys(*stream, "lamp", frame))[0]
+                f(exposure.flicker)
+                * standard_normal(np.zeros(1, np.uint32), stream_keys(*stream, "lamp", frame))[0]
             )
         signal = lit.ambient + lamp * lit.gain * (low + weight * (high - low))
         if lit.bounced is not None:
@@ -324,7 +359,9 @@ def test_kernel_and_numpy_give_the_same_bytes(name):
     ]
     for pixels, part in cases:
         read = exposure.expose(FRAMES, part, pixels, (42, "mug", "A0"))
-        np.testing.assert_array_equal(read, in_numpy(exposure, FRAMES, part, pixels, (42, "mug", "A0")))
+        np.testing.assert_array_equal(
+            read, in_numpy(exposure, FRAMES, part, pixels, (42, "mug", "A0"))
+        )
 
 
 def test_light_and_sensor_one_after_the_other_give_the_same_bytes():
@@ -334,14 +371,17 @@ def test_light_and_sensor_one_after_the_other_give_the_same_bytes():
     pixels = np.arange(5000, dtype=np.uint32)
     part = subset(lit, np.arange(5000 * 4))
     whole = exposure.expose(FRAMES, part, pixels, (1, "mug", "A0"))
-    light_grey = exposure.radiance(FRAMES, part, (1, "mug", "A0"), np.empty(whole.shape, np.float32))
+    light_grey = exposure.radiance(
+        FRAMES, part, (1, "mug", "A0"), np.empty(whole.shape, np.float32)
+    )
     sensed = exposure.sense(FRAMES, light_grey, pixels, (1, "mug", "A0"), np.empty_like(whole))
     np.testing.assert_array_equal(sensed, whole)
 
 
 @pytest.mark.parametrize("index", [0, 30, 42, 51])
 def test_pattern_lookup_is_opencv_remap_of_the_pattern_image(index):
-    """Bilinear lookup against cv2.remap on the projected image itself: OpenCV rounds weights to 1/32 px."""
+    """Bilinear lookup against cv2.remap on the projected image itself: OpenCV rounds weights to
+    1/32 px."""
     exposure = exposure_of(rays_across=1, full_well_e=None)
     u, v, lit = randomly_lit(exposure, PAPER)
     lit = replace(lit, bounced=None)
@@ -357,8 +397,8 @@ def test_pattern_lookup_is_opencv_remap_of_the_pattern_image(index):
     ).ravel()
     expected = np.clip(lit.ambient + lit.gain * (light / 255), 0, 255)
     steepest = np.abs(np.diff(image, axis=0)).max() + np.abs(np.diff(image, axis=1)).max()
-    # Half a grey level of rounding, a weight wrong by up to 1/64 px on the steepest flank, and 0.01 grey levels for
-    # OpenCV's float32 coordinates: 3e-5 px at 941 px, times 255 grey levels per px.
+    # Half a grey level of rounding, a weight wrong by up to 1/64 px on the steepest flank, and 0.01
+    # grey levels for OpenCV's float32 coordinates: 3e-5 px at 941 px, times 255 grey levels per px.
     tolerance = 0.5 + steepest / 64 * lit.gain.max() / 255 + 0.01
     assert np.abs(read - expected).max() <= tolerance
     assert np.abs(read - expected).mean() < 0.3

@@ -1,4 +1,5 @@
-"""Reflectance: the matte part, GGX against Walter et al.'s formulas as printed, grazing directions."""
+"""Reflectance: the matte part, GGX against Walter et al.'s formulas as printed, grazing
+directions."""
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ def directions(cosine, azimuth):
 
 
 def printed_ggx(light, view, roughness):
-    """f of a GGX conductor without Fresnel loss, (n,): Walter et al. 2007, equations 33, 34 and 20, with angles."""
+    """f of a GGX conductor without Fresnel loss, (n,): Walter et al. 2007, equations 33, 34 and 20,
+    with angles."""
     alpha = roughness**2
     half = light + view
     half /= np.linalg.norm(half, axis=-1, keepdims=True)

@@ -1,4 +1,5 @@
-"""Whole views: what is lit, dark, flagged and decoded, how well, and what is left out without changing a byte."""
+"""Whole views: what is lit, dark, flagged and decoded, how well, and what is left out without
+changing a byte."""
 
 from dataclasses import replace
 
@@ -45,13 +46,15 @@ def test_shadows_off_traces_no_shadow_ray_and_on_darkens_what_is_hidden():
     white, depth = plain.frames[51].copy(), plain.depth_exact_mm.copy()
     assert plain.measured["shadow_rays"] == 0
     row = shaded.photograph(mesh, "A0")
-    # Shadow rays start on the object, and on the background where the object can cast a shadow; nowhere else.
+    # Shadow rays start on the object, and on the background where the object can cast a shadow;
+    # nowhere else.
     scene = shaded.trace(mesh, "A0")
     behind = row.measured["shadow_rays"] - scene.lit.shadow_rays
     assert 500 < behind < X.size / 10
     np.testing.assert_array_equal(row.depth_exact_mm, depth)
     dark = white.astype(int) - row.frames[51] > 20
-    # By hand: the wall's front is at 1.89 m, the block spans 1.69 to 1.71 m; lines from the light through the block.
+    # By hand: the wall's front is at 1.89 m, the block spans 1.69 to 1.71 m; lines from the light
+    # through the block.
     points = np.stack([X, Y, np.ones_like(X)], axis=-1) * depth[..., None] / 1000
     wall = np.abs(depth - 1890) < 0.01
     hidden = np.zeros(X.shape, dtype=bool)
@@ -65,7 +68,8 @@ def test_shadows_off_traces_no_shadow_ray_and_on_darkens_what_is_hidden():
     assert dark[wall & hidden].all()
     assert not dark[wall & surely_lit].any()
     assert (row.frames[51][wall & hidden] == 6).all()
-    # The block's and the wall's shadows fall on the background plane too, and nothing there is brighter than before.
+    # The block's and the wall's shadows fall on the background plane too, and nothing there is
+    # brighter than before.
     background = depth == 0
     assert dark[background].sum() > 100
     assert (row.frames[51].astype(int) <= white).all()
@@ -79,7 +83,9 @@ def test_shadows_off_traces_no_shadow_ray_and_on_darkens_what_is_hidden():
 def test_decoded_depth_is_within_theory_of_the_exact_depth(sigma_grey):
     row = studio(noisy(sigma_grey)).photograph(solid(trimesh.creation.icosphere(5, 0.12)), "A0")
     exact, frames = row.depth_exact_mm, [row.frames[index] for index in range(52)]
-    white, black = (row.frames[index].astype(float) for index in (RIG.sequence.white, RIG.sequence.black))
+    white, black = (
+        row.frames[index].astype(float) for index in (RIG.sequence.white, RIG.sequence.black)
+    )
     bright = (edge_distance_px(exact) >= 4) & object_mask(exact) & (white - black > 60)
     assert bright.sum() > 300
     modulation = (white - black)[bright] / 2
@@ -90,7 +96,8 @@ def test_decoded_depth_is_within_theory_of_the_exact_depth(sigma_grey):
         decoded = decode_stack(frames, RIG, direction=direction, mask=object_mask(exact)).depth_mm
         error = decoded[bright].astype(float) - exact[bright]
         assert (decoded[bright] > 0).all()
-        # The pattern's own rounding to 8 bit and its bilinear blend add a little to the noise of the sensor.
+        # The pattern's own rounding to 8 bit and its bilinear blend add a little to the noise of
+        # the sensor.
         assert 0.9 < np.sqrt((error**2).mean() / (expected**2).mean()) < 1.2
         assert abs(error.mean()) < 4 * expected.mean() / np.sqrt(bright.sum()) + 0.05
 
@@ -119,13 +126,17 @@ def test_ground_truth_error_by_hand():
     assert errors["gt_interior_px"] == 36  # 12 - 2 x 3 px on each side
     assert errors["gt_interior_mae_mm"] == pytest.approx(3 / 36)
     empty = ground_truth_error(np.zeros_like(exact), exact, flags)
-    assert empty["gt_mae_mm"] is None and empty["gt_max_mm"] is None and empty["undecoded_px"] == 144
+    assert (
+        empty["gt_mae_mm"] is None and empty["gt_max_mm"] is None and empty["undecoded_px"] == 144
+    )
 
 
 # ---- stages
 
 
-GROOVE = sheet(([0, 0, -0.1], [-0.1, 0.1, 0], [0, 0, 0.2]), ([0, 0, -0.1], [-0.1, -0.1, 0], [0, 0, 0.2]))
+GROOVE = sheet(
+    ([0, 0, -0.1], [-0.1, 0.1, 0], [0, 0, 0.2]), ([0, 0, -0.1], [-0.1, -0.1, 0], [0, 0, 0.2])
+)
 """Two squares at a right angle that opens to the camera in view A0."""
 
 
@@ -138,7 +149,8 @@ def test_what_faces_away_from_the_projector_is_unlit():
     right = solid(trimesh.creation.box((0.1, 0.1, 0.2)).apply_translation([0.0, 0.12, 0.0]))
     row = studio().photograph(right, "A0")
     exact = row.depth_exact_mm
-    # By hand: the front is at 1.75 m; the side at x = -0.07 m faces the camera's axis and turns its back on the light.
+    # By hand: the front is at 1.75 m; the side at x = -0.07 m faces the camera's axis and turns its
+    # back on the light.
     side = (exact > 1750.5) & (np.abs(X * exact / 1000 + 0.07) < 1e-6)
     assert side.sum() > 20
     np.testing.assert_array_equal(flagged(row, Flag.UNLIT), side)
@@ -146,8 +158,9 @@ def test_what_faces_away_from_the_projector_is_unlit():
 
 
 def test_groove_is_flagged_where_light_comes_from_the_other_side():
-    """Bounces over direct light, in the groove: more than a quarter at its bottom, less at its rim, by Lambert's
-    formula a point x of the way up an endless right-angled side gets (1 - x / sqrt(1 + x^2)) / 2 of the other."""
+    """Bounces over direct light, in the groove: more than a quarter at its bottom, less at its rim,
+    by Lambert's formula a point x of the way up an endless right-angled side gets (1 - x / sqrt(1 +
+    x^2)) / 2 of the other."""
     row = studio(PAPER).photograph(GROOVE, "A0")
     seen, strong = row.depth_exact_mm > 0, flagged(row, Flag.INTERREFLECTION)
     inside = seen & (np.abs(Y) < 0.02)
@@ -165,21 +178,28 @@ def test_saturation_is_flagged_where_white_is_at_the_end_of_the_range():
     saturated = flagged(row, Flag.SATURATED)
     assert 100 < saturated.sum() < seen.sum()
     assert (white[saturated] == 255).all() and (white[seen & ~saturated] <= 255).all()
-    assert (white[seen & ~saturated] == 255).sum() < 0.05 * saturated.sum()  # 254.5 is rounded to 255
+    assert (
+        white[seen & ~saturated] == 255
+    ).sum() < 0.05 * saturated.sum()  # 254.5 is rounded to 255
     assert not flagged(studio().photograph(BALL, "A0"), Flag.SATURATED).any()
 
 
 def test_weak_light_is_flagged_by_half_of_what_white_adds_to_black():
-    """Without noise: the rim of the ball, which is turned away, and most of it under a tenth of the light."""
+    """Without noise: the rim of the ball, which is turned away, and most of it under a tenth of the
+    light."""
     dim = DIRECT.changed("camera", full_well_e=None, read_noise_e=0.0)
     for light, least, most in ((dim, 0.001, 0.1), (dim.changed("camera", exposure=0.1), 0.2, 0.99)):
         row = studio(light).photograph(BALL, "A0")
         weak, unlit = flagged(row, Flag.WEAK), flagged(row, Flag.UNLIT)
         seen = (row.depth_exact_mm > 0) & ~flagged(row, Flag.MIXED) & ~unlit
-        white, black = (row.frames[i].astype(float) for i in (RIG.sequence.white, RIG.sequence.black))
+        white, black = (
+            row.frames[i].astype(float) for i in (RIG.sequence.white, RIG.sequence.black)
+        )
         fringes = (white - black) / 2
         assert least <= weak[seen].mean() <= most and not weak[row.depth_exact_mm == 0].any()
-        assert (fringes[weak & seen] <= WEAK_GREY + 0.5).all() and (fringes[seen & ~weak] >= WEAK_GREY - 0.5).all()
+        assert (fringes[weak & seen] <= WEAK_GREY + 0.5).all() and (
+            fringes[seen & ~weak] >= WEAK_GREY - 0.5
+        ).all()
 
 
 def test_the_flags_are_the_same_whatever_is_projected():
@@ -190,7 +210,8 @@ def test_the_flags_are_the_same_whatever_is_projected():
 
 
 def test_bounces_add_light_and_nothing_else():
-    """With all bounces off a view is direct light and the ambient: the closed form, pixel by pixel."""
+    """With all bounces off a view is direct light and the ambient: the closed form, pixel by
+    pixel."""
     row = studio(DIRECT).photograph(BALL, "A0")
     white, black, exact = row.frames[51].astype(float), row.frames[50], row.depth_exact_mm / 1000
     points = np.stack([X, Y, np.ones_like(X)], axis=-1) * exact[..., None]
@@ -198,7 +219,9 @@ def test_bounces_add_light_and_nothing_else():
     mesh_normals = (points - [0, 0, 1.8]) / 0.12
     to = CENTRE - points
     distance = np.linalg.norm(to, axis=-1)
-    expected = 6 + 180 * (1.5 / distance) ** 2 * np.clip((mesh_normals * to).sum(axis=-1) / distance, 0, None)
+    expected = 6 + 180 * (1.5 / distance) ** 2 * np.clip(
+        (mesh_normals * to).sum(axis=-1) / distance, 0, None
+    )
     assert np.abs(white - expected)[inside].max() < 15  # the ball has facets of 9 degrees
     assert np.abs((white - expected)[inside].mean()) < 0.5
     assert (black[inside] == 6).all()
@@ -212,10 +235,13 @@ def test_ambient_occlusion_is_the_open_share_of_the_groove():
     light = DIRECT.changed("bounces", ambient_occlusion=True).changed(ambient_grey=200.0)
     row = studio(light, rig=SMALL).photograph(GROOVE, "A0")
     dark = row.frames[SMALL.sequence.black].astype(float)
-    inside = (row.depth_exact_mm > 0) & (np.abs(Y) < 0.01) & (edge_distance_px(row.depth_exact_mm) > 3)
+    inside = (
+        (row.depth_exact_mm > 0) & (np.abs(Y) < 0.01) & (edge_distance_px(row.depth_exact_mm) > 3)
+    )
     x = np.abs(X * row.depth_exact_mm / 1000)[inside] * np.sqrt(2)  # up the side, of 0.1414 m
     side = np.hypot(0.1, 0.1)
-    # Endless groove, then its length of 0.2 m: the middle sees arctangents of it (Lambert's contour, two terms of it).
+    # Endless groove, then its length of 0.2 m: the middle sees arctangents of it (Lambert's
+    # contour, two terms of it).
     half = 0.1
     reach = np.hypot(x, side)
     share = (np.arctan(half / x) - x / reach * np.arctan(half / reach)) / np.pi
@@ -240,7 +266,8 @@ def test_an_object_is_cut_into_surfels_once_for_all_its_views_and_lights(monkeyp
 @pytest.mark.parametrize("stored", ["single_shot", "all"])
 @pytest.mark.parametrize("name", ["paper", "workshop", "hard", "moving"])
 def test_skipping_changes_no_byte(name, stored):
-    """Frames that are stored, ground truth and flags; twice, so that nothing of another view is left in the memory."""
+    """Frames that are stored, ground truth and flags; twice, so that nothing of another view is
+    left in the memory."""
     mixing = DIRECT.changed("camera", rays_across=2)
     light = mixing.changed(motion_mm=3.0) if name == "moving" else named_light(name)
     light = light.changed("projector", defocus_px=0.5) if name == "hard" else light
@@ -279,7 +306,8 @@ def test_calibration_error_moves_the_pattern_and_not_the_depth():
     np.testing.assert_array_equal(row.depth_exact_mm, other.depth_exact_mm)
     both = object_mask(row.depth_mm) & object_mask(other.depth_mm)
     error = (other.depth_mm - row.depth_exact_mm)[both]
-    # 1 px of disparity is Z^2 / (f b) = 14 mm; two directions, and some of the error is a shift along epipolar lines.
+    # 1 px of disparity is Z^2 / (f b) = 14 mm; two directions, and some of the error is a shift
+    # along epipolar lines.
     assert 1 < np.abs(error).mean() < 40
     assert plain.rig == SMALL and off.settings.rig == SMALL and off.rig != SMALL
 
@@ -304,7 +332,9 @@ def test_the_object_moves_from_frame_to_frame():
     white = row.frames[21].astype(float).copy()
     at.photograph(BALL, "A0")
     moves = np.array(traces[1:])  # the first is the view's own
-    np.testing.assert_allclose(np.linalg.norm(np.diff(moves, axis=0), axis=1), step_mm / 1000, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(moves, axis=0), axis=1), step_mm / 1000, rtol=1e-6
+    )
     assert len(moves) == len(SMALL.sequence)
     moved = original(at, BALL, "A0", moves[21])
     lit = np.zeros(X.size, bool)

@@ -1,4 +1,5 @@
-"""The report: which samples it shows, that its pictures hold the numbers they claim, and that text stays text."""
+"""The report: which samples it shows, that its pictures hold the numbers they claim, and that text
+stays text."""
 
 import base64
 import re
@@ -31,7 +32,9 @@ def scored(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("predictions")
     for number, sample in enumerate(dataset.samples("all")):
         depth = dataset.depth_mm(sample)
-        np.save(folder / f"{sample}.npy", np.where(depth > 0, depth + 1 + number, 0).astype(np.float32))
+        np.save(
+            folder / f"{sample}.npy", np.where(depth > 0, depth + 1 + number, 0).astype(np.float32)
+        )
     write_description(folder, name="A <b>method</b>")
     return folder, evaluate(folder, dataset, "all")
 
@@ -56,9 +59,15 @@ def test_page_shows_the_best_the_median_and_the_worst(dataset, scored, tmp_path)
     assert f"mean {statistics.fmean(range(1, 9)):.3f} mm" in text
     assert "95% interval" in text and "Every sample, the largest object MAE first" in text
     outside = [
-        address for address in re.findall(r'(?:src|href)="([^"]*)"', text) if not address.startswith(("data:", "#"))
+        address
+        for address in re.findall(r'(?:src|href)="([^"]*)"', text)
+        if not address.startswith(("data:", "#"))
     ]
-    assert outside == [] and path.read_bytes() == write_report(result, dataset, folder, tmp_path / "two").read_bytes()
+    assert (
+        outside == []
+        and path.read_bytes()
+        == write_report(result, dataset, folder, tmp_path / "two").read_bytes()
+    )
 
 
 def test_few_samples_are_shown_once_each(scored):
@@ -80,12 +89,19 @@ def test_panels_show_the_errors_they_claim():
     prediction = target + error
     prediction[0, 0] = 1799
     fringe = rng.integers(0, 255, target.shape).astype(np.uint8)
-    panels = {title.partition(",")[0]: panel for title, *panel in sample_panels(fringe, target, prediction)}
+    panels = {
+        title.partition(",")[0]: panel
+        for title, *panel in sample_panels(fringe, target, prediction)
+    }
     assert list(panels) == ["Fringe", "Truth", "Prediction", "Absolute error", "Signed error"]
     difference = prediction.astype(float) - target
     clip = np.percentile(np.abs(difference[10:30, 10:30]), CLIP_PERCENTILE)
     assert panels["Absolute error"][1:] == ["magma", 0.0, pytest.approx(clip, rel=1e-6)]
-    assert panels["Signed error"][1:] == ["coolwarm", pytest.approx(-clip, rel=1e-6), pytest.approx(clip, rel=1e-6)]
+    assert panels["Signed error"][1:] == [
+        "coolwarm",
+        pytest.approx(-clip, rel=1e-6),
+        pytest.approx(clip, rel=1e-6),
+    ]
     visible = (target > 0) | (prediction > 0)  # a pixel predicted in the background is visible too
     for title, expected in (("Absolute error", np.abs(difference)), ("Signed error", difference)):
         np.testing.assert_array_equal(panels[title][0], np.where(visible, expected, np.nan))
@@ -100,7 +116,9 @@ def test_flat_and_empty_samples_have_pictures(value):
     assert decoded(picture).shape[0] > 200
 
 
-@pytest.mark.parametrize("errors", [[1.0], [0.0, 0.0], [2.0, np.nextafter(2.0, 3)], [1e-320, 1e-300], [0.0, 1e30]])
+@pytest.mark.parametrize(
+    "errors", [[1.0], [0.0, 0.0], [2.0, np.nextafter(2.0, 3)], [1e-320, 1e-300], [0.0, 1e30]]
+)
 def test_any_errors_have_a_figure(errors):
     image = decoded(errors_figure(errors, None))
     assert image.shape[0] > 200 and image[..., :3].min() < 100
@@ -143,7 +161,11 @@ def test_what_was_not_scored_is_not_reported(dataset, scored, tmp_path):
 
 def test_command_and_browser(dataset, tmp_path):
     folder = write_predictions(
-        tmp_path / "p", dataset, offset_mm=1.0, noise_mm=2.0, name="</title><script>hacked = 1</script>"
+        tmp_path / "p",
+        dataset,
+        offset_mm=1.0,
+        noise_mm=2.0,
+        name="</title><script>hacked = 1</script>",
     )
     assert fpp_eval(folder, dataset.path, "--report", tmp_path / "out") == 0
     page = tmp_path / "out" / "index.html"
@@ -154,7 +176,10 @@ def test_command_and_browser(dataset, tmp_path):
             assert browser.complaints() == [] and browser.requests() == [page.resolve().as_uri()]
             assert browser.run("document.documentElement.scrollWidth") <= width
             assert browser.run("typeof hacked") == "undefined"
-            assert browser.run("[...document.images].every(i => i.complete && i.naturalWidth > 0)") is True
+            assert (
+                browser.run("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+                is True
+            )
             assert browser.run("document.images.length") == 1 + 4
     finally:
         browser.close()

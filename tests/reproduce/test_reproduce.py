@@ -1,4 +1,5 @@
-"""`fpp-bench reproduce` from trainings to tables, with trainings that take no time: what is made, kept and refused."""
+"""`fpp-bench reproduce` from trainings to tables, with trainings that take no time: what is made,
+kept and refused."""
 
 import json
 import re
@@ -75,8 +76,8 @@ def small(monkeypatch, opened, request):
 
 
 class Trainer:
-    """Stands in for the engine: weights drawn from a seed, in the engine's own files. ``says`` maps a recipe's name to
-    what happens instead of finishing."""
+    """Stands in for the engine: weights drawn from a seed, in the engine's own files. ``says`` maps
+    a recipe's name to what happens instead of finishing."""
 
     def __init__(self) -> None:
         self.trained, self.says, self.seed = [], {}, 0
@@ -99,9 +100,15 @@ class Trainer:
         # Untrained, its output would be refused for its unit: a little around a depth that can be.
         with torch.no_grad():
             network.head.weight.mul_(0.01)
-            network.head.bias.fill_({"raw": 1500.0, "global": 1.5, "individual": 0.4}[recipe.normalisation])
-        save_weights(out / depth_training.WEIGHTS, network, model_config(recipe, network, opened, 3, {}))
-        (out / depth_training.DONE).write_text(json.dumps({"epochs": 5, "best_epoch": 3, "seconds": 61.4}))
+            network.head.bias.fill_(
+                {"raw": 1500.0, "global": 1.5, "individual": 0.4}[recipe.normalisation]
+            )
+        save_weights(
+            out / depth_training.WEIGHTS, network, model_config(recipe, network, opened, 3, {})
+        )
+        (out / depth_training.DONE).write_text(
+            json.dumps({"epochs": 5, "best_epoch": 3, "seconds": 61.4})
+        )
         return depth_training.finished_run(out)
 
 
@@ -122,7 +129,16 @@ def unscored(monkeypatch):
 def run(tiny, tmp_path, trainer):
     """Run the command on the tiny dataset below ``tmp_path``."""
     return lambda *words: main(
-        ["reproduce", words[0], str(tiny), *map(str, words[1:]), "--out", str(tmp_path / "runs"), "--workers", "1"]
+        [
+            "reproduce",
+            words[0],
+            str(tiny),
+            *map(str, words[1:]),
+            "--out",
+            str(tmp_path / "runs"),
+            "--workers",
+            "1",
+        ]
     )
 
 
@@ -130,22 +146,30 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     assert run(TABLE) == 0
     below = tmp_path / "runs" / "small"
     assert trainer.trained == [name.removeprefix("small-") for name in (*NAMES, *SEEDED)]
-    assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted((*NAMES, *SEEDED))
+    assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted(
+        (*NAMES, *SEEDED)
+    )
     entries = {path.stem: read_entry(path) for path in (below / "rows").glob("*.json")}
     assert all(entry.is_row_file for entry in entries.values())
-    tracks = {name: (entry.row.track, entry.row.mode, entry.row.target) for name, entry in entries.items()}
+    tracks = {
+        name: (entry.row.track, entry.row.mode, entry.row.target) for name, entry in entries.items()
+    }
     assert tracks[NAMES[2]] == ("oracle range", "paper", "depth")
     assert {tracks[name] for name in (*NAMES[:2], *SEEDED[:4])} == {("metric", "standard", "depth")}
     assert all(entry.name.endswith("(small preset)") for entry in entries.values())
     assert [len(group.rows) for group in rank(entries.values())] == [6, 3]
     for name, entry in entries.items():
-        assert entry.row.timing.parameters == sum(p.numel() for p in build("unet", width=1).parameters())
+        assert entry.row.timing.parameters == sum(
+            p.numel() for p in build("unet", width=1).parameters()
+        )
         for folder in ("results", "rows"):
             files = str(below / folder / f"{name}.json"), str(below / "predictions" / name)
             assert fpp_eval(["verify", *files, str(tiny)]) == 0
     text = (below / f"{TABLE}.md").read_text()
     lines = {
-        line.split(" | ")[0].strip("| "): line for line in text.split("## ")[0].splitlines() if line.startswith("| ")
+        line.split(" | ")[0].strip("| "): line
+        for line in text.split("## ")[0].splitlines()
+        if line.startswith("| ")
     }
     each = [entries[name].row.metrics.object_mae_mm for name in (NAMES[2], *SEEDED[-2:])]
     assert f"| oracle range | {np.mean(each):.2f} / " in lines["individual"]
@@ -169,7 +193,9 @@ def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
     (rows / f"{NAMES[1]}.json").unlink()
     (rows / f"{NAMES[2]}.json").write_text("{")
     assert run(TABLE, "--only-missing") == 0
-    changed = {name.removesuffix(".json") for name, stamp in stamps(rows).items() if first[name] != stamp}
+    changed = {
+        name.removesuffix(".json") for name, stamp in stamps(rows).items() if first[name] != stamp
+    }
     assert changed == {*NAMES[1:]}
     assert run(TABLE) == 0 and len(trainer.trained) == 9
     assert not set(stamps(rows).items()) & set(first.items())
@@ -178,7 +204,9 @@ def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
 def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_path):
     assert run(TABLE) == 0
     below = tmp_path / "runs" / "small"
-    weights_before = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings["weights_sha256"]
+    weights_before = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings[
+        "weights_sha256"
+    ]
     (below / "unet-individual-rmse" / "done.json").unlink()
     trainer.says["unet-individual-rmse"] = "out of time"
     trainer.seed = 1
@@ -186,13 +214,19 @@ def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_pa
     assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
     trainer.says.clear()
     assert run(TABLE, "--only-missing") == 0
-    weights_after = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings["weights_sha256"]
+    weights_after = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings[
+        "weights_sha256"
+    ]
     assert weights_before != weights_after and len(trainer.trained) == 10
 
 
 def test_rows_of_another_machine_are_shown_if_of_the_same_recipe(run, trainer, tmp_path):
     def lines():
-        return [line for line in (below / f"{TABLE}.md").read_text().splitlines() if line.startswith("| individual |")]
+        return [
+            line
+            for line in (below / f"{TABLE}.md").read_text().splitlines()
+            if line.startswith("| individual |")
+        ]
 
     below = tmp_path / "runs" / "small"
     assert run(TABLE) == 0
@@ -215,15 +249,23 @@ def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, unscored, t
     assert "Continue with: fpp-bench reproduce normalization" in out
     assert "--only-missing --minutes 5" in out
     text = (tmp_path / "runs" / "small" / f"{TABLE}.md").read_text()
-    assert "Not measured here: raw, global, individual. To fill: `fpp-bench reproduce normalization" in text
+    assert (
+        "Not measured here: raw, global, individual. To fill: `fpp-bench reproduce normalization"
+        in text
+    )
     trainer.says.clear()
     assert run(TABLE, "--only-missing", "--minutes", "5") == 0
 
 
 def test_a_training_that_fails_does_not_stop_the_others(run, trainer, unscored, tmp_path, capsys):
-    trainer.says["unet-global-rmse"] = TrainingError("training diverged: loss is not finite in batch 3")
+    trainer.says["unet-global-rmse"] = TrainingError(
+        "training diverged: loss is not finite in batch 3"
+    )
     assert run(TABLE) == 2
-    assert "1 of 9 rows could not be made:\n  unet-global-rmse: training diverged" in capsys.readouterr().err
+    assert (
+        "1 of 9 rows could not be made:\n  unet-global-rmse: training diverged"
+        in capsys.readouterr().err
+    )
     text = (tmp_path / "runs" / "small" / f"{TABLE}.md").read_text()
     assert "- global: training diverged" in text
     assert len(trainer.trained) == 8
@@ -246,7 +288,10 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
     (out / "recipe.json").write_text(json.dumps({"recipe": other, "fingerprint": 64 * "0"}))
     assert run(TABLE) == 2
     error = capsys.readouterr().err
-    assert "batch (8 there, 4 in the recipe), seed (1 there, 42 in the recipe)" in error and f"mv {out}" in error
+    assert (
+        "batch (8 there, 4 in the recipe), seed (1 there, 42 in the recipe)" in error
+        and f"mv {out}" in error
+    )
     assert trainer.trained == []
     (out / "recipe.json").write_text("[]")
     assert run(TABLE) == 2 and "can't be read" in capsys.readouterr().err
@@ -257,7 +302,9 @@ def test_a_training_on_another_dataset_is_refused(run, trainer, unscored, tmp_pa
     path = tmp_path / "runs" / "small" / "unet-individual-rmse" / "recipe.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"fingerprint": 64 * "a"}))
     assert run(TABLE) == 2
-    assert "is of aaaaaaaa; give that dataset as DATASET, or another --out" in capsys.readouterr().err
+    assert (
+        "is of aaaaaaaa; give that dataset as DATASET, or another --out" in capsys.readouterr().err
+    )
 
 
 def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, capsys):
@@ -282,11 +329,15 @@ def test_every_frame_is_scored_for_the_multi_frame_table(run, trainer, tmp_path,
     result = read_result(below / "results" / "small-unet-individual-rmse-vertical.json")
     row = read_entry(below / "rows" / "small-unet-individual-rmse-vertical.json").row
     assert result.submission.frames_used == row.submission.frames_used == [18]
-    assert scores.errors["object_mae_mm"] == pytest.approx(np.mean(list(scores.per_object.values())), rel=1e-9)
+    assert scores.errors["object_mae_mm"] == pytest.approx(
+        np.mean(list(scores.per_object.values())), rel=1e-9
+    )
     table = (below / "multi_frame.md").read_text().split("## ")[0]
     lines = [line for line in table.splitlines() if line.startswith("| 18 vertical")]
     assert len(lines) == 2 and "its first frame only" in lines[1]
-    assert f"| {scores.errors['object_mae_mm']:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
+    assert (
+        f"| {scores.errors['object_mae_mm']:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
+    )
     assert f"| {row.metrics.object_mae_mm:.2f} / " in lines[1] and "12.36" not in lines[1]
     for key in ("overall_mae_mm", "object_mae_mm"):
         assert sum(scores.counts[key]) == scores.pairs
@@ -307,10 +358,14 @@ def test_files_of_scores_are_read_strictly(opened, tmp_path):
         return np.zeros(frame.shape, np.float32)
 
     recipe, samples = load_recipe("loss/rmse"), opened.samples(SPLIT)
-    scores = score_frames(opened, zeros, [0, 3], RULES, samples, **IDENTITY | {"recipe_digest": recipe.digest})
+    scores = score_frames(
+        opened, zeros, [0, 3], RULES, samples, **IDENTITY | {"recipe_digest": recipe.digest}
+    )
     path = tmp_path / "all.json"
     write_json(scores.model_dump(mode="json"), path)
-    assert read_scores(path) == scores == scores_that_hold(path, opened.fingerprint, recipe, 64 * "a")
+    assert (
+        read_scores(path) == scores == scores_that_hold(path, opened.fingerprint, recipe, 64 * "a")
+    )
     assert scores_that_hold(path, opened.fingerprint, recipe, 64 * "b") is None
     assert scores_that_hold(path, opened.fingerprint, load_recipe("loss/l1")) is None
     assert scores.errors["background_mae_mm"] == 0 and scores.errors["object_mae_mm"] > 1500
@@ -332,7 +387,10 @@ def test_histograms_are_numpys():
 
 def test_scores_of_one_frame_are_the_evaluators(opened, tmp_path):
     rng = np.random.default_rng(0)
-    noise = {sample: rng.uniform(0.0, 1.0, opened.size).astype(np.float32) for sample in opened.samples(SPLIT)}
+    noise = {
+        sample: rng.uniform(0.0, 1.0, opened.size).astype(np.float32)
+        for sample in opened.samples(SPLIT)
+    }
     waiting = iter(noise.values())
     folder = tmp_path / "predictions"
     folder.mkdir()
@@ -364,7 +422,10 @@ def test_every_object_is_left_out_once(run, trainer, tmp_path, opened):
         assert set(found.per_object) == {owners[sample] for sample in splits["test"]}
     assert not list((below / "rows").glob("*.json"))
     text = (below / "folds.md").read_text()
-    mae = np.average([found.errors["object_mae_mm"] for found in scores], weights=[found.pairs for found in scores])
+    mae = np.average(
+        [found.errors["object_mae_mm"] for found in scores],
+        weights=[found.pairs for found in scores],
+    )
     line = next(line for line in text.splitlines() if "hybrid L1" in line)
     assert f"| {mae:.2f} / " in line and "| 14.54 / 17.88 |" in line
     assert "best constant in the given range (trivial)" in text
@@ -372,7 +433,9 @@ def test_every_object_is_left_out_once(run, trainer, tmp_path, opened):
     # A table that the paper does not have.
     assert run("further/plain", "--folds", "3") == 0
     assert "| metric |" in next(
-        text for text in (below / "folds.md").read_text().splitlines() if text.startswith("| further/plain")
+        text
+        for text in (below / "folds.md").read_text().splitlines()
+        if text.startswith("| further/plain")
     )
     trained_on = json.loads((below / names[1] / "recipe.json").read_text())["recipe"]["fold"]
     assert trained_on == [1, 3]
@@ -385,7 +448,9 @@ def test_the_best_constant_is_best(opened):
     def mae_mm(share):
         answer = np.full(opened.size, share, np.float32)
         rules = Rules("depth", "normalised", "valid", "paper")
-        return score_frames(opened, lambda frame: answer, [0], rules, samples, **IDENTITY).errors["object_mae_mm"]
+        return score_frames(opened, lambda frame: answer, [0], rules, samples, **IDENTITY).errors[
+            "object_mae_mm"
+        ]
 
     assert 0 < best < 1 and mae_mm(best) < min(mae_mm(best - 0.02), mae_mm(best + 0.02))
 
@@ -413,7 +478,11 @@ def test_list_and_help_do_not_train(run, trainer, capsys, tmp_path, monkeypatch)
     assert "Those of the other 34 are not measured yet: a training takes" in listed
     assert main(["reproduce"]) == 2
     assert "expected a table" in capsys.readouterr().err
-    for table, problem in (("nonsense", "expected a table"), ("loss/l2", "no row 'l2'"), ("loss/", "no row ''")):
+    for table, problem in (
+        ("nonsense", "expected a table"),
+        ("loss/l2", "no row 'l2'"),
+        ("loss/", "no row ''"),
+    ):
         assert main(["reproduce", table]) == 2
         assert problem in capsys.readouterr().err
     assert main(["reproduce", TABLE, "--minutes", "nan"]) == 2

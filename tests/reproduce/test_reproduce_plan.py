@@ -1,4 +1,5 @@
-"""What `fpp-bench reproduce` plans to do, on which dataset, and how it judges the paper's orderings."""
+"""What `fpp-bench reproduce` plans to do, on which dataset, and how it judges the paper's
+orderings."""
 
 from dataclasses import replace
 from statistics import fmean
@@ -62,8 +63,15 @@ def test_rows_of_one_recipe_are_one_training(preset):
     networks = [job.recipe.network for job in first]
     assert first == jobs[:26] and networks[:21] == ["unet"] * 21 and "unet" not in networks[21:]
     further = [(job.recipe.name.rpartition("-")[0], job.recipe.seed) for job in jobs[26:]]
-    seeded = ["unet-raw-rmse", "unet-global-rmse", "unet-individual-rmse", "unet-individual-hybrid_l1_0.7"]
-    assert further == ([] if preset == "paper" else [(name, seed) for name in seeded for seed in (1, 2)])
+    seeded = [
+        "unet-raw-rmse",
+        "unet-global-rmse",
+        "unet-individual-rmse",
+        "unet-individual-hybrid_l1_0.7",
+    ]
+    assert further == (
+        [] if preset == "paper" else [(name, seed) for name in seeded for seed in (1, 2)]
+    )
     names = [job.recipe.name for job in jobs]
     assert len(set(names)) == len(names)
     titles = [job.recipe.title for job in jobs]
@@ -77,7 +85,10 @@ def test_lines_hold_the_papers_numbers(tmp_path, dataset):
         for row in paper_tables()[table].rows if table in paper_tables() else ():
             assert (by_row[row.row].paper_mm, by_row[row.row].label) == (row.errors_mm, row.label)
         extra = [name for name, line in by_row.items() if line.paper_mm is None]
-        not_the_papers = {"architecture": ["pix2pixhd", "hformer"], "further": ["plain", "guided", "physics"]}
+        not_the_papers = {
+            "architecture": ["pix2pixhd", "hformer"],
+            "further": ["plain", "guided", "physics"],
+        }
         assert extra == not_the_papers.get(table, [])
         assert all(line.found == {} and line.entry is None for line in by_row.values())
 
@@ -88,7 +99,9 @@ def test_two_recipes_under_one_name_are_refused(monkeypatch):
         return recipe.model_copy(update={"batch": 7}) if name == "loss/rmse" else recipe
 
     monkeypatch.setattr(plan, "load_recipe", other_batch)
-    with pytest.raises(RecipeError, match=r"normalization/individual and loss/rmse differ in batch \(4 and 7\)"):
+    with pytest.raises(
+        RecipeError, match=r"normalization/individual and loss/rmse differ in batch \(4 and 7\)"
+    ):
         planned(rows_of(["normalization", "loss"]), "small")
 
 
@@ -101,27 +114,40 @@ def test_a_dataset_of_another_size_is_refused(tmp_path):
     small = make_dataset(tmp_path / "other")
     jobs = planned(rows_of(["normalization"]), "small")
     with pytest.raises(
-        DatasetError, match=r"expected images of 224 x 224 px, which preset small .* got 40 x 32.*--size"
+        DatasetError,
+        match=r"expected images of 224 x 224 px, which preset small .* got 40 x 32.*--size",
     ):
         open_dataset(small.path, jobs, folders(tmp_path), print)
 
 
 def test_a_dataset_without_the_frames_is_refused(tmp_path, dataset):
     with pytest.raises(
-        DatasetError, match="multi_frame/horizontal needs the frames of horizontal, stored are those of"
+        DatasetError,
+        match="multi_frame/horizontal needs the frames of horizontal, stored are those of",
     ):
-        open_dataset(dataset.path, planned(rows_of(["multi_frame"]), "small"), folders(tmp_path), print)
+        open_dataset(
+            dataset.path, planned(rows_of(["multi_frame"]), "small"), folders(tmp_path), print
+        )
 
 
-def line(label: str, paper_mae: float | None, *seeds: dict[str, float], entry: Entry | None = None) -> Line:
+def line(
+    label: str, paper_mae: float | None, *seeds: dict[str, float], entry: Entry | None = None
+) -> Line:
     """A line with these object errors of each seed, sample ``object_view`` to mm."""
-    paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
+    paper = (
+        None
+        if paper_mae is None
+        else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
+    )
     found = {}
     for seed, errors in enumerate(seeds):
         of_objects: dict[str, list[float]] = {}
         for sample, error in errors.items():
             of_objects.setdefault(sample.rpartition("_")[0], []).append(error)
-        parts = [SimpleNamespace(object=name, object_mae_mm=fmean(views)) for name, views in of_objects.items()]
+        parts = [
+            SimpleNamespace(object=name, object_mae_mm=fmean(views))
+            for name, views in of_objects.items()
+        ]
         found[seed] = SimpleNamespace(per_object=parts, metrics=SimpleNamespace(model_dump=dict))
     return Line(label, label, load_recipe("loss/rmse"), found, entry, paper)
 
@@ -154,14 +180,17 @@ def test_orderings_are_judged_by_number():
     turned = orderings([line("best", 1.0, views(12.0)), line("worse", 2.0, noise)])
     assert [ordering.verdict for ordering in turned] == ["reversed"]
     assert orderings_sentence(judged).endswith(
-        "3 among the rows measured here. Decided by 10 objects, with Holm's correction: 1 hold, 0 reversed. Only seen "
+        "3 among the rows measured here. Decided by 10 objects, with Holm's correction: 1 hold, 0 "
+        "reversed. Only seen "
         "in the mean over them: 1 as in the paper, 1 reversed."
     )
     assert orderings([line("a", 1.0, noise), line("b", 1.0, views(12.0))]) == []
     assert "none of its orderings" in orderings_sentence([])
 
 
-@pytest.mark.parametrize(("count", "verdicts"), [(5, ("seen", "seen reversed")), (6, ("holds", "reversed"))])
+@pytest.mark.parametrize(
+    ("count", "verdicts"), [(5, ("seen", "seen reversed")), (6, ("holds", "reversed"))]
+)
 def test_five_objects_decide_nothing(count, verdicts):
     """However large and equal their differences are, and although the interval leaves 0 out."""
     near, far = (views(base, objects="abcdefghij"[:count]) for base in (1.0, 100.0))
@@ -170,11 +199,16 @@ def test_five_objects_decide_nothing(count, verdicts):
         assert [ordering.verdict for ordering in judged] == [verdict]
         assert judged[0].here.interval[0] * judged[0].here.interval[1] > 0
         assert judged[0].p_holm == 2 / 2**count
-        assert ("Fewer than 6 objects can decide none" in orderings_sentence(judged)) == (count == 5)
+        assert ("Fewer than 6 objects can decide none" in orderings_sentence(judged)) == (
+            count == 5
+        )
 
 
 def test_each_further_pair_of_a_table_makes_the_others_harder_to_decide():
-    lines = [line("a", 1.0, views(1.0, objects="abcdef")), line("b", 2.0, views(9.0, objects="abcdef"))]
+    lines = [
+        line("a", 1.0, views(1.0, objects="abcdef")),
+        line("b", 2.0, views(9.0, objects="abcdef")),
+    ]
     assert [ordering.verdict for ordering in orderings(lines)] == ["holds"]
     lines.append(line("c", 3.0, views(20.0, objects="abcdef")))
     judged = orderings(lines)
@@ -214,7 +248,11 @@ def two_results(tmp_path, dataset):
     """Timed on two machines."""
     folders = [
         write_predictions(
-            tmp_path / cpu, dataset, offset_mm=offset, noise_mm=2.0 * offset, hardware={**HARDWARE, "cpu": cpu}
+            tmp_path / cpu,
+            dataset,
+            offset_mm=offset,
+            noise_mm=2.0 * offset,
+            hardware={**HARDWARE, "cpu": cpu},
         )
         for cpu, offset in (("first", 1.0), ("second", 3.0))
     ]
@@ -224,7 +262,10 @@ def two_results(tmp_path, dataset):
 def test_the_difference_is_that_of_compare(tmp_path, dataset):
     results = two_results(tmp_path, dataset)
     entries = [Entry(tmp_path / "x.json", row_of(result, tmp_path)) for result in results]
-    lines = [replace(line(str(n), float(n), entry=entry), found={42: entry.row}) for n, entry in enumerate(entries, 1)]
+    lines = [
+        replace(line(str(n), float(n), entry=entry), found={42: entry.row})
+        for n, entry in enumerate(entries, 1)
+    ]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
     expected = [difference.mean_mm, *difference.interval_mm]
     assert [ordering.here.mean_mm, *ordering.here.interval] == pytest.approx(expected, rel=1e-3)
@@ -241,7 +282,9 @@ def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tm
     results = two_results(tmp_path, dataset)
     lines = [
         replace(line(name, None, entry=Entry(tmp_path / "x.json", row)), found={42: row})
-        for name, row in zip(("the image alone", "guided"), (row_of(r, tmp_path) for r in results), strict=True)
+        for name, row in zip(
+            ("the image alone", "guided"), (row_of(r, tmp_path) for r in results), strict=True
+        )
     ]
     difference = compare(*results).differences["object_mae_mm"]
     low, high = difference.interval_mm
@@ -257,9 +300,16 @@ def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tm
 def test_rows_that_were_not_measured_stay_empty():
     empty = line("masked | L1", 18.0)
     text = table_markdown(
-        "loss", [empty], "paper", "fpp-bench reproduce loss --preset paper", {empty.recipe.name: "boom"}
+        "loss",
+        [empty],
+        "paper",
+        "fpp-bench reproduce loss --preset paper",
+        {empty.recipe.name: "boom"},
     )
-    assert "Not measured here: masked &#124; L1. To fill: `fpp-bench reproduce loss --preset paper`" in text
+    assert (
+        "Not measured here: masked &#124; L1. To fill: `fpp-bench reproduce loss --preset paper`"
+        in text
+    )
     assert "masked &#124; L1: boom" in text
     cells = next(row for row in text.splitlines() if row.startswith("| masked")).split(" | ")
     assert cells[2] == cells[3] == "-" and "18.00 / 21.19" in cells

@@ -1,4 +1,5 @@
-"""`fpp-eval` from a dataset folder to a result file, and which result files are refused when they are read."""
+"""`fpp-eval` from a dataset folder to a result file, and which result files are refused when they
+are read."""
 
 import json
 import subprocess
@@ -27,7 +28,9 @@ def predictions(tmp_path, dataset):
 def scored(folder, dataset, tmp_path, *arguments):
     path = tmp_path / "result.json"
     assert fpp_eval(folder, dataset.path, "--json", path, *arguments) == 0
-    return json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} in the JSON"))
+    return json.loads(
+        path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} in the JSON")
+    )
 
 
 def test_result_says_what_was_scored_on_what(dataset, predictions, tmp_path):
@@ -41,13 +44,21 @@ def test_result_says_what_was_scored_on_what(dataset, predictions, tmp_path):
         "content": {name: dataset.content[name] for name in ("test/depth", "test/flags")},
     }
     assert result["frames_class"] == "one frame"
-    assert result["submission"] == {**DESCRIPTION, "timing": None, "png_mm_per_level": None, "seeds": {}}
+    assert result["submission"] == {
+        **DESCRIPTION,
+        "timing": None,
+        "png_mm_per_level": None,
+        "seeds": {},
+    }
     assert result["target"] == "depth"
     assert result["edge_band_px"] == 3 and result["edge_jump_mm"] == 240.0
     assert set(result["metrics"]) == {key for key in METRICS if not key.startswith("unlit")}
     assert set(result["pooled"]) == set(HEADLINE)
     for row in result["per_sample"]:
-        assert row["prediction_sha256"] == sha256((predictions / f"{row['sample']}.npy").read_bytes()).hexdigest()
+        assert (
+            row["prediction_sha256"]
+            == sha256((predictions / f"{row['sample']}.npy").read_bytes()).hexdigest()
+        )
         assert row["object_pixels"] == np.count_nonzero(dataset.depth_mm(row["sample"]))
     assert result["environment"]["packages"]["numpy"] == np.__version__
 
@@ -68,7 +79,9 @@ def test_every_real_float_format_is_read(kind, order, dataset, tmp_path):
         np.save(path, np.asarray(np.load(path) + np.float32(8.0), dtype=kind, order=order))
     metrics = scored(folder, dataset, tmp_path)["metrics"]
     if kind == "<f2":
-        assert metrics["object_mae_mm"] == pytest.approx(8.0, abs=1.0)  # float16 resolves 1 mm at 1.8 m
+        assert metrics["object_mae_mm"] == pytest.approx(
+            8.0, abs=1.0
+        )  # float16 resolves 1 mm at 1.8 m
         assert metrics["background_mae_mm"] == 8.0
     else:
         assert {metrics[key] for key in HEADLINE} == {8.0}
@@ -82,7 +95,9 @@ def test_dataset_folder_of_any_name(tmp_path):
         assert dataset_name == ["x" * 100 + "...", "a\\x1b[31m", "dataset"][number]
 
 
-@pytest.mark.parametrize("split, samples", [("train", 2), ("validation", 2), ("test", 4), ("all", 8)])
+@pytest.mark.parametrize(
+    "split, samples", [("train", 2), ("validation", 2), ("test", 4), ("all", 8)]
+)
 def test_every_split(split, samples, dataset, tmp_path):
     folder = write_predictions(tmp_path / "predictions", dataset, split=split)
     assert len(scored(folder, dataset, tmp_path, "--split", split)["per_sample"]) == samples
@@ -121,8 +136,12 @@ def test_same_result_twice_and_from_one_thread(dataset, predictions, monkeypatch
 
 
 def test_table_shows_submitted_text_as_text(dataset, tmp_path):
-    folder = write_predictions(tmp_path / "predictions", dataset, name="[bold red]x[/] :smile: [link=http://e]y[/link]")
-    assert "[bold red]x[/] :smile: [link=http://e]y[/link]" in printed(fpp_eval, folder, dataset.path)
+    folder = write_predictions(
+        tmp_path / "predictions", dataset, name="[bold red]x[/] :smile: [link=http://e]y[/link]"
+    )
+    assert "[bold red]x[/] :smile: [link=http://e]y[/link]" in printed(
+        fpp_eval, folder, dataset.path
+    )
 
 
 EDITS = {
@@ -132,10 +151,18 @@ EDITS = {
     "missing key": ("target", ..., "target: is missing"),
     "negative": ("metrics.object_mae_mm", -1.0, "metrics.object_mae_mm: .*greater"),
     "text": ("metrics.object_mae_mm", "0.1", "metrics.object_mae_mm: .*number"),
-    "better headline": ("metrics.object_mae_mm", 0.001, "metrics.object_mae_mm does not follow from per_sample"),
+    "better headline": (
+        "metrics.object_mae_mm",
+        0.001,
+        "metrics.object_mae_mm does not follow from per_sample",
+    ),
     "better median": ("median.overall_rmse_mm", 0.001, "median.overall_rmse_mm does not follow"),
     "better pool": ("pooled.overall_mae_mm", 0.001, "pooled.overall_mae_mm does not follow"),
-    "better sample": ("per_sample.0.object_mae_mm", 0.001, "bias or shift-free MAE is above the MAE"),
+    "better sample": (
+        "per_sample.0.object_mae_mm",
+        0.001,
+        "bias or shift-free MAE is above the MAE",
+    ),
     "impossible RMSE": ("per_sample.0.object_rmse_mm", 0.001, "RMSE is below its MAE"),
     "null score": ("per_sample.0.object_mae_mm", None, "null exactly when the set is empty"),
     "pixels": ("per_sample.0.object_pixels", 5, "do not add up"),
@@ -216,7 +243,9 @@ def test_help_is_light_and_scoring_needs_no_torch(dataset, predictions):
     script += "if m in sys.modules])"
 
     def loaded(*arguments):
-        done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True
+        )
         return json.loads(done.stdout.splitlines()[-1].replace("'", '"'))
 
     assert loaded("--help") == []

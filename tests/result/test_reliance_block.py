@@ -1,4 +1,5 @@
-"""Phase reliance in result files and on the leaderboard: written, read back, shown, and refused where it can't be."""
+"""Phase reliance in result files and on the leaderboard: written, read back, shown, and refused
+where it can't be."""
 
 import json
 import re
@@ -86,7 +87,9 @@ def test_it_stands_on_the_leaderboard_beside_error_and_time(file, tmp_path, data
     write_block(read_entry(file), Reliance(**block()))
     groups = rank(read_entries([file, other]))
     shown = readme_block(groups)
-    assert re.search(r"\| A method \|.*\| 0\.62 \|", shown) and re.search(r"\| Not asked \|.*\| not measured \|", shown)
+    assert re.search(r"\| A method \|.*\| 0\.62 \|", shown) and re.search(
+        r"\| Not asked \|.*\| not measured \|", shown
+    )
     pages = page_files(groups, [])
     index = pages["index.html"].decode()
     assert "Phase reliance" in index and "0.50 to 0.75" in index and "not measured" in index
@@ -94,7 +97,10 @@ def test_it_stands_on_the_leaderboard_beside_error_and_time(file, tmp_path, data
     assert sum("What it reads" in text for text in details) == 1
     rows = json.loads(pages["data.json"])["groups"][0]["rows"]
     assert [row["phase_reliance"] for row in rows] == [0.625, None]
-    assert [part.get("reliance", {}).get("score") for row in rows for part in row["parts"]] == [0.625, None]
+    assert [part.get("reliance", {}).get("score") for row in rows for part in row["parts"]] == [
+        0.625,
+        None,
+    ]
 
 
 class Method:
@@ -127,11 +133,18 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     opened = DatasetFolder(tiny)
     used = [*opened.sequence.sinusoids("horizontal")[::6], *opened.sequence.gray("horizontal")]
     settings = {"direction": "horizontal", "steps": 3}
-    row = write_result_file(tmp_path / "r.json", dataset, 1.0, method="classical", frames_used=used, settings=settings)
+    row = write_result_file(
+        tmp_path / "r.json", dataset, 1.0, method="classical", frames_used=used, settings=settings
+    )
     options = ["--steps", "3", "--direction", "horizontal", "--views", "1"]
-    assert fpp_bench("reliance", "classical", tiny, *options, "--into", row, "--json", tmp_path / "b") == 0
+    assert (
+        fpp_bench("reliance", "classical", tiny, *options, "--into", row, "--json", tmp_path / "b")
+        == 0
+    )
     written = read_result(row).reliance
-    assert written is not None and written.score > 0.9 and written.interval == [None, None]  # one test object
+    assert (
+        written is not None and written.score > 0.9 and written.interval == [None, None]
+    )  # one test object
     assert Reliance(**read_json(tmp_path / "b")) == written
     assert "phase reliance, 0 to 1" in capsys.readouterr().out
     assert "very method that was scored" in refusal(
@@ -140,5 +153,7 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     assert fpp_bench("reliance", "classical", tiny, "--views", "7") == 2
     capsys.readouterr()
     out = printed(fpp_bench, "reliance", "constant", tiny, "--views", "1")
-    assert "Constant depth: standoff: gives the same answer whatever phase, light and outline" in out
+    assert (
+        "Constant depth: standoff: gives the same answer whatever phase, light and outline" in out
+    )
     assert "follows" not in out and "changes" not in out

@@ -12,7 +12,15 @@ import pytest
 from fpp_ml_bench.baselines.learned.scenes import HELD_OUT, drawn_light
 from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.robustness import axes
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Condition, FrameCache, Truth, corruptions, score
+from fpp_ml_bench.baselines.robustness.axes import (
+    CLEAN,
+    SETS,
+    Condition,
+    FrameCache,
+    Truth,
+    corruptions,
+    score,
+)
 from fpp_ml_bench.baselines.robustness.run import Setup, measure, robustness, write_page
 from fpp_ml_bench.baselines.trivial import ConstantMethod
 from fpp_ml_bench.cli import main
@@ -46,7 +54,8 @@ def frames(axis: str, severity: int, wanted=ONE_FRAME, cache=None):
 
 
 class Noisy(Method):
-    """Answers with the middle of the range and noise; ``silent`` answers nothing; ``sigma_mm`` is what it claims."""
+    """Answers with the middle of the range and noise; ``silent`` answers nothing; ``sigma_mm`` is
+    what it claims."""
 
     name, title, frames_used, settings = "noisy", "Noisy", ONE_FRAME, {}
     silent, sigma_mm, noise_mm = False, None, 0.0
@@ -57,7 +66,11 @@ class Noisy(Method):
     def answer(self, stack):
         noise = np.random.default_rng(1).normal(0, self.noise_mm, (SIZE, SIZE))
         depth = np.zeros((SIZE, SIZE)) if self.silent else 1800 + noise
-        sigma = None if self.sigma_mm is None else np.full((SIZE, SIZE), self.sigma_mm, dtype=np.float32)
+        sigma = (
+            None
+            if self.sigma_mm is None
+            else np.full((SIZE, SIZE), self.sigma_mm, dtype=np.float32)
+        )
         return Answer(depth.astype(np.float32), sigma)
 
 
@@ -65,7 +78,10 @@ def test_the_issues_severities_are_those_of_the_file():
     severities = {name: list(axis.severities) for name, axis in RULES.axes.items()}
     assert severities["under-exposure"] == [0.7, 0.5, 0.35, 0.25, 0.15]
     assert severities["motion"] == [0.1, 0.25, 0.5, 1, 2]
-    assert len(severities) == 14 and [name for name, axis in RULES.axes.items() if axis.beside] == list(severities)[12:]
+    assert (
+        len(severities) == 14
+        and [name for name, axis in RULES.axes.items() if axis.beside] == list(severities)[12:]
+    )
     assert all(set(views) <= set(VIEWS) for views in corruptions.__wrapped__().views.values())
 
 
@@ -80,7 +96,9 @@ def test_severity_0_is_the_clean_frame_bit_for_bit_and_5_is_another(axis):
 
 def test_a_frame_is_that_of_the_dataset_whatever_else_is_asked_for():
     clean = frames(CLEAN, 0, (0, 18, 20))
-    assert np.array_equal(clean[0], frames(CLEAN, 0)[0]) and clean[1] is None and clean[18] is not None
+    assert (
+        np.array_equal(clean[0], frames(CLEAN, 0)[0]) and clean[1] is None and clean[18] is not None
+    )
 
 
 def test_frames_of_two_rigs_are_kept_apart(tmp_path):
@@ -93,10 +111,14 @@ def test_frames_of_two_rigs_are_kept_apart(tmp_path):
 
 def test_dark_paint_is_on_the_object_and_a_dark_wall_behind_it():
     inside = FrameCache(None).truth(condition(CLEAN, 0), OBJECT, "A0").depth_mm > 0
-    clean, painted, dark = (frames(*of)[0].astype(float) for of in ((CLEAN, 0), ("dark-paint", 5), ("dark-wall", 5)))
+    clean, painted, dark = (
+        frames(*of)[0].astype(float) for of in ((CLEAN, 0), ("dark-paint", 5), ("dark-wall", 5))
+    )
     assert painted[inside].mean() < 0.2 * clean[inside].mean()
     assert painted[~inside].mean() == pytest.approx(clean[~inside].mean(), rel=0.02)
-    assert dark[inside].mean() == pytest.approx(clean[inside].mean(), rel=0.1)  # the wall lights the object a little
+    assert dark[inside].mean() == pytest.approx(
+        clean[inside].mean(), rel=0.1
+    )  # the wall lights the object a little
     assert dark[~inside].mean() < 1.0
 
 
@@ -139,14 +161,20 @@ def test_what_a_training_drew_is_said_by_its_recipe():
     before = Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn
     assert "camera-blur" in before and "dark-paint" not in before and "motion" not in before
     Learned.weights_config.recipe["held_out"] = list(HELD_OUT)
-    assert Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn == [name for name in before if name != "camera-blur"]
+    assert Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn == [
+        name for name in before if name != "camera-blur"
+    ]
     assert Setup(Noisy(paper_rig(SIZE)), "test", SIZE).drawn == []
 
 
 def test_silence_costs_half_the_working_range():
     scores = score(np.zeros((SIZE, SIZE)), None, truth(), RULES, CHARGE_MM)
     assert scores["mae_mm"] == CHARGE_MM == 300
-    assert scores["unanswered_share"] == 1 and scores["wrong_share"] == 0 and scores["coverage"] is None
+    assert (
+        scores["unanswered_share"] == 1
+        and scores["wrong_share"] == 0
+        and scores["coverage"] is None
+    )
 
 
 def test_missed_invented_and_the_error_of_what_is_answered_are_told_apart():
@@ -206,7 +234,9 @@ def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
         assert set(rows) == {CLEAN, *chosen} and len(rows[chosen[0]]) == 3
         means[number] = rows[chosen[0]][0]
     assert means[1]["mae_mm"] == CHARGE_MM and means[1]["unanswered_share"] == 1
-    assert means[0]["mae_mm"] > 250 and means[0]["wrong_share"] > 0.5 and means[0]["coverage"] is None
+    assert (
+        means[0]["mae_mm"] > 250 and means[0]["wrong_share"] > 0.5 and means[0]["coverage"] is None
+    )
     assert means[2]["confident_share"] == means[2]["wrong_share"] > 0.5
     assert means[3]["answered_mae_mm"] < 150 and means[3]["wrong_share"] < 0.1
 
@@ -262,7 +292,8 @@ def test_the_cache_is_used_mended_and_kept_small(tmp_path, monkeypatch):
 
 
 def rows_of(axes_maes: dict[str, list[list[float]]]):
-    """Rows by axis from errors by severity and sample; samples s0, s1, ... of objects o0, o0, o1, o1, ..."""
+    """Rows by axis from errors by severity and sample; samples s0, s1, ... of objects o0, o0, o1,
+    o1, ..."""
     found = {}
     for axis, severities in axes_maes.items():
         found[axis] = [
@@ -329,7 +360,11 @@ def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
     assert "Constant depth: training-mean" in capsys.readouterr().out
     assert main(["robustness", "constant", "--at", "1700", *words]) == 0
     page = (out / "index.html").read_text(encoding="utf-8")
-    assert "Constant depth, 1700 mm" in page and "Constant depth: training-mean" in page and "<script" not in page
+    assert (
+        "Constant depth, 1700 mm" in page
+        and "Constant depth: training-mean" in page
+        and "<script" not in page
+    )
     assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
     (method,) = (json.loads(file.read_text()) for file in out.glob("*mean*/read-noise.json"))
     assert [row["severity"] for row in method["views"]] == [1, 3, 5]
@@ -337,8 +372,32 @@ def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
 
 
 def test_the_scenes_show_the_fringes_that_an_option_asks_for(tmp_path):
-    words = ["--fringes", "crossed", "--members", "1", "--size", "256", "--quick", "--axes", "gloss"]
-    assert main(["robustness", "fringe-net", *words, "--out", str(tmp_path), "--no-cache", "--workers", "1"]) == 0
+    words = [
+        "--fringes",
+        "crossed",
+        "--members",
+        "1",
+        "--size",
+        "256",
+        "--quick",
+        "--axes",
+        "gloss",
+    ]
+    assert (
+        main(
+            [
+                "robustness",
+                "fringe-net",
+                *words,
+                "--out",
+                str(tmp_path),
+                "--no-cache",
+                "--workers",
+                "1",
+            ]
+        )
+        == 0
+    )
     (file,) = tmp_path.glob("*/clean.json")
     (row,) = json.loads(file.read_text())["views"]
     assert row["answered_mae_mm"] < 5
@@ -348,7 +407,10 @@ def test_the_scenes_show_the_fringes_that_an_option_asks_for(tmp_path):
     ("words", "said"),
     [
         (["constant", "--at", "nowhere"], "at 'nowhere': expected standoff"),
-        (["constant", "--steps", "3"], "--steps is an option of classical, classical-net, not of constant"),
+        (
+            ["constant", "--steps", "3"],
+            "--steps is an option of classical, classical-net, not of constant",
+        ),
         (["constant", "--quick", "--into", "x.json"], "--into: needs all axes"),
     ],
 )

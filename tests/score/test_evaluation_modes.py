@@ -1,4 +1,5 @@
-"""Units and modes: mm, m and normalised depth, and the paper's rule for individually normalised rows."""
+"""Units and modes: mm, m and normalised depth, and the paper's rule for individually normalised
+rows."""
 
 import numpy as np
 import pytest
@@ -34,14 +35,17 @@ def write_normalised(folder, dataset, noise=0.01, **changes):
 
 
 def to_the_letter(values, target):
-    """Paper Section 5.3.2 under individual normalisation, literally: normalise, mask, denormalise both, subtract."""
+    """Paper Section 5.3.2 under individual normalisation, literally: normalise, mask, denormalise
+    both, subtract."""
     low, high = span_of(target)
     target_norm = (target.astype(np.longdouble) - low) / (high - low) * (target > 0)
     inside = target_norm > 0
     error = (values.astype(np.longdouble) * (high - low) + low) - (target_norm * (high - low) + low)
     sets = {"overall": np.ones_like(inside), "object": inside, "background": ~inside}
     scores = {f"{name}_mae_mm": np.abs(error[pixels]).mean() for name, pixels in sets.items()}
-    return scores | {f"{name}_rmse_mm": np.sqrt((error[pixels] ** 2).mean()) for name, pixels in sets.items()}
+    return scores | {
+        f"{name}_rmse_mm": np.sqrt((error[pixels] ** 2).mean()) for name, pixels in sets.items()
+    }
 
 
 def test_paper_mode_is_the_papers_rule_to_the_letter(dataset, tmp_path):
@@ -79,7 +83,10 @@ def test_denormalising_is_the_training_sides_inverse(dataset):
     target = dataset.depth_mm(sample)
     values = np.random.default_rng(0).uniform(0.01, 1.0, target.shape)
     depth, same = scored_pair(values, target, "normalised", "standard", sample)
-    assert np.array_equal(depth, denormalise(values, "individual", *span_of(target))) and same is target
+    assert (
+        np.array_equal(depth, denormalise(values, "individual", *span_of(target)))
+        and same is target
+    )
 
 
 def test_metres_score_like_millimetres(dataset, tmp_path):
@@ -89,12 +96,16 @@ def test_metres_score_like_millimetres(dataset, tmp_path):
         np.save(path, np.load(path).astype(np.float64) / 1000)
     in_mm, in_m = (evaluate(folder, dataset).metrics.model_dump() for folder in (mm, m))
     for key, value in in_mm.items():
-        assert in_m[key] == (value if value is None else pytest.approx(value, rel=1e-9, abs=1e-9)), key
+        assert in_m[key] == (
+            value if value is None else pytest.approx(value, rel=1e-9, abs=1e-9)
+        ), key
 
 
 def test_modes_and_tracks_cannot_be_mixed_up(dataset, tmp_path):
     normalised = write_normalised(tmp_path / "n", dataset, uses_ground_truth_range=False)
-    assert "units: normalised needs uses_ground_truth_range: true" in refusal(fpp_eval, normalised, dataset.path)
+    assert "units: normalised needs uses_ground_truth_range: true" in refusal(
+        fpp_eval, normalised, dataset.path
+    )
     write_description(normalised, **ORACLE)
     written = tmp_path / "r.json"
     command = [str(normalised), str(dataset.path), "--mode", "paper", "--json", str(written)]
@@ -115,7 +126,8 @@ def test_a_target_without_range_is_refused_by_sample():
 
 @pytest.mark.parametrize("mode", ["standard", "paper"])
 def test_a_range_without_void_pixels(mode, tmp_path):
-    """A void pixel 300 mm behind the object widens the range of ``object``, not that of ``valid``."""
+    """A void pixel 300 mm behind the object widens the range of ``object``, not that of
+    ``valid``."""
 
     def flagged(depth):
         flags = np.zeros(depth.shape, np.uint8)
@@ -135,12 +147,15 @@ def test_a_range_without_void_pixels(mode, tmp_path):
         for sample in dataset.samples("test"):
             depth, void = dataset.depth_mm(sample).astype(np.float64), dataset.void(sample)
             low, high = span_of(np.where(void, 0, depth) if rule == "valid" else depth)
-            np.save(folder / f"{sample}.npy", np.where(depth > 0, (depth + 2 - low) / (high - low), 0))
+            np.save(
+                folder / f"{sample}.npy", np.where(depth > 0, (depth + 2 - low) / (high - low), 0)
+            )
         write_description(folder, **ORACLE, **({"range_rule": rule} if rule == "valid" else {}))
         scores[rule] = evaluate(folder, dataset, mode=mode)
         assert scores[rule].metrics.object_mae_mm == pytest.approx(2.0, abs=1e-9)
     assert (
-        scores["valid"].submission.range_rule == "valid" and "range_rule" not in scores["object"].submission.to_yaml()
+        scores["valid"].submission.range_rule == "valid"
+        and "range_rule" not in scores["object"].submission.to_yaml()
     )
     write_description(folder, range_rule="valid")
     with pytest.raises(PredictionError, match="range_rule is that of normalised depth"):
@@ -155,8 +170,14 @@ def test_another_reading_is_said_and_changes_no_score(tmp_path, recwarn, capsys)
     scored = fpp_ml_bench.evaluate(predictions, dataset)
     assert "upside down" in str(recwarn.pop().message)
     assert fpp_eval(predictions, dataset.path, "--json", tmp_path / "r.json") == 0
-    assert "fpp-eval: note: another reading fits the predictions far better: upside down" in capsys.readouterr().err
+    assert (
+        "fpp-eval: note: another reading fits the predictions far better: upside down"
+        in capsys.readouterr().err
+    )
     for sample in dataset.samples("test"):
         np.save(predictions / f"{sample}.npy", dataset.depth_mm(sample))
-    assert fpp_ml_bench.evaluate(predictions, dataset).metrics.object_mae_mm < scored.metrics.object_mae_mm
+    assert (
+        fpp_ml_bench.evaluate(predictions, dataset).metrics.object_mae_mm
+        < scored.metrics.object_mae_mm
+    )
     assert not recwarn.list

@@ -21,7 +21,8 @@ WITHIN = [key for key in METRICS if "_within_" in key]
 
 
 def test_unequal_magnitudes_are_not_lost():
-    """A background of tiny errors beside an object of huge ones: float32, or overall minus object, would lose it."""
+    """A background of tiny errors beside an object of huge ones: float32, or overall minus object,
+    would lose it."""
     target = disk_depth((64, 64), 3).astype(np.float64)
     computed = score_sample(np.where(target > 0, target + 1e12, 1e-6), target).metrics()
     assert computed["background_mae_mm"] == pytest.approx(1e-6, rel=1e-14)
@@ -36,7 +37,9 @@ def test_block_borders_and_empty_blocks(monkeypatch):
         monkeypatch.setattr(sample_scores, "BLOCK", block)
         blocked = score_sample(prediction, target).metrics()
         for key, value in expected.items():
-            assert blocked[key] == (value if value is None else pytest.approx(value, rel=1e-12, abs=1e-13)), key
+            assert blocked[key] == (
+                value if value is None else pytest.approx(value, rel=1e-12, abs=1e-13)
+            ), key
 
 
 def test_closed_forms_of_a_shift_and_of_nothing():
@@ -64,7 +67,9 @@ def test_missing_pixels_are_counted_and_left_out_of_the_valid_score_only():
     assert s.metrics()["object_missing_share"] == 0.3
     assert s.valid == ErrorStats(14, 1.0, 1.0)
     assert s.object.mae_mm == pytest.approx((5 * 1800 + 1803 + 14) / 20, rel=1e-15)
-    assert s.object.rmse_mm == pytest.approx(math.sqrt((5 * 1800**2 + 1803**2 + 14) / 20), rel=1e-15)
+    assert s.object.rmse_mm == pytest.approx(
+        math.sqrt((5 * 1800**2 + 1803**2 + 14) / 20), rel=1e-15
+    )
 
 
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 40), st.integers(0, 2**32 - 1))
@@ -72,8 +77,12 @@ def test_missing_pixels_are_counted_and_left_out_of_the_valid_score_only():
 def test_edge_band_is_the_distance_rule(height, width, band, seed):
     """The dilation must give the very pixels of OpenCV's exact Euclidean distance transform."""
     rng = np.random.default_rng(seed)
-    depth = np.where(rng.random((height, width)) < 0.9, 1800.0 + 300.0 * (rng.random((height, width)) < 0.1), 0.0)
-    assert np.array_equal(object_near_edge(depth, band), (edge_distance_px(depth) < band) & (depth > 0))
+    depth = np.where(
+        rng.random((height, width)) < 0.9, 1800.0 + 300.0 * (rng.random((height, width)) < 0.1), 0.0
+    )
+    assert np.array_equal(
+        object_near_edge(depth, band), (edge_distance_px(depth) < band) & (depth > 0)
+    )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
@@ -86,7 +95,9 @@ def test_errors_that_are_not_finite_never_become_a_score(bad, inside):
     with pytest.raises(PredictionError, match="finite"):
         score_sample(prediction, target)
     with pytest.raises(PredictionError, match="finite"):
-        score_sample(target, np.where(target > 0, np.inf, target) if math.isinf(bad) else target * np.nan)
+        score_sample(
+            target, np.where(target > 0, np.inf, target) if math.isinf(bad) else target * np.nan
+        )
 
 
 def test_wrong_arguments_are_named():
@@ -102,7 +113,9 @@ def test_wrong_arguments_are_named():
 def test_combine_is_the_union():
     rng = np.random.default_rng(4)
     parts = [rng.normal(0, 10.0**k, 50 + k) for k in range(4)]
-    stats = [ErrorStats(p.size, float(np.abs(p).mean()), float(np.sqrt((p**2).mean()))) for p in parts]
+    stats = [
+        ErrorStats(p.size, float(np.abs(p).mean()), float(np.sqrt((p**2).mean()))) for p in parts
+    ]
     union = np.concatenate(parts).astype(np.longdouble)
     combined = combine(*stats, EMPTY)
     assert combined.pixels == union.size
@@ -112,14 +125,20 @@ def test_combine_is_the_union():
 
 
 def test_averages_over_samples_and_pixels_differ_as_documented():
-    """Two samples of unequal object size: the mean counts samples alike, pooling counts pixels alike."""
+    """Two samples of unequal object size: the mean counts samples alike, pooling counts pixels
+    alike."""
     small, large = np.zeros((10, 10)), np.zeros((10, 10))
     small[:1] = 1800.0  # 10 px, error 4
     large[:9] = 1800.0  # 90 px, error 1
-    samples = [score_sample(small + 4 * (small > 0), small), score_sample(large + 1 * (large > 0), large)]
+    samples = [
+        score_sample(small + 4 * (small > 0), small),
+        score_sample(large + 1 * (large > 0), large),
+    ]
     without_object = score_sample(np.ones((10, 10)), np.zeros((10, 10)))
     rows = [s.metrics() for s in (*samples, without_object)]
-    inside, outside = (combine(*(getattr(s, pixels) for s in samples)) for pixels in ("object", "background"))
+    inside, outside = (
+        combine(*(getattr(s, pixels) for s in samples)) for pixels in ("object", "background")
+    )
     pool = pooled(inside, combine(outside, without_object.background))
     assert over_samples(rows)["object_mae_mm"] == 2.5
     assert over_samples(rows, statistics.median)["object_mae_mm"] == 2.5

@@ -1,4 +1,5 @@
-"""The torchmetrics metric: the evaluator's numbers whatever the batches, the order and the number of processes."""
+"""The torchmetrics metric: the evaluator's numbers whatever the batches, the order and the number
+of processes."""
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ SIZE, SAMPLES, CHARGE_MM = (40, 48), 11, 300.0
 
 
 def data():
-    """Predictions and targets (N, H, W), one sample without object, one without background, missing pixels."""
+    """Predictions and targets (N, H, W), one sample without object, one without background, missing
+    pixels."""
     rng = np.random.default_rng(5)
     target = np.stack([disk_depth(SIZE, seed) for seed in range(SAMPLES)])
     target[3] = 0.0
@@ -61,7 +63,10 @@ def _process(rank, address, folder):
     metric = DepthScores(charge_mm=CHARGE_MM)
     indices = range(7) if rank == 0 else range(7, SAMPLES)  # unequal shares
     for index in indices:
-        metric.update(torch.from_numpy(prediction[index : index + 1]), torch.from_numpy(target[index : index + 1]))
+        metric.update(
+            torch.from_numpy(prediction[index : index + 1]),
+            torch.from_numpy(target[index : index + 1]),
+        )
     scores = {key: float(value) for key, value in metric.compute().items()}
     metric.reset()  # rank 1 gets no sample, as in a short last epoch
     if rank == 0:
@@ -92,7 +97,10 @@ def test_state_stays_in_float64():
     metric = DepthScores(charge_mm=CHARGE_MM).half().float()
     prediction, target = data()
     metric.update(torch.from_numpy(prediction)[:, None], torch.from_numpy(target)[:, None])
-    assert metric.sums.dtype == torch.float64 and metric.compute()["object_mae_mm"].dtype == torch.float64
+    assert (
+        metric.sums.dtype == torch.float64
+        and metric.compute()["object_mae_mm"].dtype == torch.float64
+    )
     assert_same({key: float(value) for key, value in metric.compute().items()}, scored(1))
     metric.reset()
     assert float(metric.counts.sum()) == 0
@@ -133,10 +141,18 @@ def test_gradients_are_not_held_and_bad_batches_are_refused():
 
 DEPTH = torch.full((1, 4, 5), 1800.0)
 BATCHES = {
-    "void as uint8": ({}, (DEPTH, DEPTH, (DEPTH > 0).to(torch.uint8)), "void: expected bool.* got torch.uint8"),
+    "void as uint8": (
+        {},
+        (DEPTH, DEPTH, (DEPTH > 0).to(torch.uint8)),
+        "void: expected bool.* got torch.uint8",
+    ),
     "void of another shape": ({}, (DEPTH, DEPTH, DEPTH[0] > 0), "void: expected .1, 4, 5."),
     "an array": ({}, (DEPTH.numpy(), DEPTH), "prediction: expected a tensor, got ndarray"),
-    "both in metres": ({}, (DEPTH / 1000, DEPTH / 1000), "the largest depth is 1.8, which could be metres"),
+    "both in metres": (
+        {},
+        (DEPTH / 1000, DEPTH / 1000),
+        "the largest depth is 1.8, which could be metres",
+    ),
     "metres": ({}, (DEPTH / 1000, DEPTH), "the prediction looks like metres"),
     "negative target": ({}, (DEPTH, -DEPTH), "targets: expected finite mm of 0 and more"),
     "unknown units": ({"units": "inch"}, None, "units: expected mm or m"),
@@ -153,7 +169,9 @@ def test_what_could_mean_something_else_is_refused(case):
 def test_units_that_are_said_are_taken():
     metres, untrained = DepthScores(units="m"), DepthScores(units="mm")
     metres.update(DEPTH / 1000 + 0.002, DEPTH / 1000)
-    assert float(metres.compute()["object_mae_mm"]) == pytest.approx(2.0, rel=1e-4)  # float32 metres
+    assert float(metres.compute()["object_mae_mm"]) == pytest.approx(
+        2.0, rel=1e-4
+    )  # float32 metres
     untrained.update(torch.full_like(DEPTH, 1.0), DEPTH)
     assert float(untrained.compute()["object_mae_mm"]) == 1799.0
 

@@ -30,11 +30,14 @@ def make(tmp_path, dataset):
 
 @pytest.mark.parametrize("freedom", [1, 2, 5, 49])
 def test_student_quantile_is_scipys(freedom):
-    assert uncertainty._student_quantile(0.975, freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-9)
+    assert uncertainty._student_quantile(0.975, freedom) == pytest.approx(
+        stats.t.ppf(0.975, freedom), rel=1e-9
+    )
 
 
 def test_interval_is_the_expanded_percentile_of_resampled_objects():
-    """Against SciPy's bootstrap at the widened level: another generator, so only roughly the same."""
+    """Against SciPy's bootstrap at the widened level: another generator, so only roughly the
+    same."""
     rng = np.random.default_rng(1)
     means = rng.normal(1.0, 0.3, 12)
     objects = np.repeat(np.arange(12), 6)
@@ -56,7 +59,8 @@ def test_interval_is_the_expanded_percentile_of_resampled_objects():
 
 
 def test_interval_covers_the_truth_about_as_often_as_it_says():
-    """Five objects of six correlated views each, as in the test split; the plain percentile interval covers 84%."""
+    """Five objects of six correlated views each, as in the test split; the plain percentile
+    interval covers 84%."""
     rng = np.random.default_rng(7)
     objects = np.repeat(np.arange(5), 6).tolist()
     covered = 0
@@ -77,7 +81,9 @@ def test_unequal_views_weigh_samples_alike_and_gaps_are_left_out():
 
 
 def test_too_few_objects_for_95_percent_are_said():
-    assert "at most 50% of cases" in uncertainty.caution(2) and "at most 88%" in uncertainty.caution(4)
+    assert "at most 50% of cases" in uncertainty.caution(
+        2
+    ) and "at most 88%" in uncertainty.caution(4)
     assert uncertainty.caution(5) is None and uncertainty.caution(1) is None
 
 
@@ -96,7 +102,11 @@ def scipy_p(differences):
 @pytest.mark.parametrize("objects", [2, 6, 12])
 def test_the_sign_flip_test_is_scipys(objects):
     rng = np.random.default_rng(objects)
-    for differences in (rng.normal(0.5, 1, objects), rng.exponential(1, objects) - 0.3, np.full(objects, 0.1)):
+    for differences in (
+        rng.normal(0.5, 1, objects),
+        rng.exponential(1, objects) - 0.3,
+        np.full(objects, 0.1),
+    ):
         assert sign_flip_p(differences.tolist()) == pytest.approx(scipy_p(differences), abs=1e-12)
     ties = rng.integers(-2, 3, objects) / 10  # sums that are equal but for rounding
     assert sign_flip_p(ties.tolist()) == pytest.approx(scipy_p(ties), abs=1e-12)
@@ -104,7 +114,13 @@ def test_the_sign_flip_test_is_scipys(objects):
 
 def test_the_sign_flip_test_at_its_ends():
     assert sign_flip_p([]) == sign_flip_p([0.0, 0.0]) == sign_flip_p([1.0, -1.0]) == 1.0
-    assert sign_flip_p([3.0] * 5) == 0.0625 > uncertainty.SIGNIFICANT > sign_flip_p([3.0] * 6) == 0.03125
+    assert (
+        sign_flip_p([3.0] * 5)
+        == 0.0625
+        > uncertainty.SIGNIFICANT
+        > sign_flip_p([3.0] * 6)
+        == 0.03125
+    )
     assert sign_flip_p([1e30] * 25) == sign_flip_p([1e-30] * 25) == 2.0**-24
     differences = np.random.default_rng(1).normal(0.4, 1, 25).tolist()
     assert sign_flip_p([-value for value in differences]) == sign_flip_p(differences)
@@ -112,8 +128,11 @@ def test_the_sign_flip_test_at_its_ends():
 
 @pytest.mark.parametrize("objects", [25, 70])
 def test_sampled_flips_agree_with_all_of_them(objects, monkeypatch):
-    """Objects without a difference change nothing; 70 of them need more than one word of random bits."""
-    differences = np.random.default_rng(objects).normal(0.3, 1, 25).tolist() + [0.0] * (objects - 25)
+    """Objects without a difference change nothing; 70 of them need more than one word of random
+    bits."""
+    differences = np.random.default_rng(objects).normal(0.3, 1, 25).tolist() + [0.0] * (
+        objects - 25
+    )
     exact = sign_flip_p(differences[:25])
     monkeypatch.setattr(uncertainty, "_EXACT_OBJECTS", 5)
     sampled = sign_flip_p(differences)
@@ -128,7 +147,9 @@ def test_holm_against_its_step_down_procedure():
             adjusted = holm(values)
             for level in (0.01, 0.05, 0.2, 0.7):
                 rejected = set()
-                for place, index in enumerate(np.argsort(values)):  # stop at the first that is not rejected
+                for place, index in enumerate(
+                    np.argsort(values)
+                ):  # stop at the first that is not rejected
                     if values[index] > level / (count - place):
                         break
                     rejected.add(int(index))
@@ -141,9 +162,14 @@ def test_result_carries_intervals_objects_and_seeds(make):
     for key in RANKED:
         low, high = getattr(result.intervals, key)
         assert low <= getattr(result.metrics, key) <= high
-    assert [(o.object, o.samples) for o in result.per_object] == [("power_drill", 2), ("wooden_boards", 2)]
+    assert [(o.object, o.samples) for o in result.per_object] == [
+        ("power_drill", 2),
+        ("wooden_boards", 2),
+    ]
     first = [row.object_mae_mm for row in result.per_sample if row.object == "power_drill"]
-    assert result.per_object[0].spread["object_mae_mm"] == pytest.approx(np.std(first, ddof=1), rel=1e-12)
+    assert result.per_object[0].spread["object_mae_mm"] == pytest.approx(
+        np.std(first, ddof=1), rel=1e-12
+    )
     assert result.seeds == {"bootstrap": 20250} and result.bootstrap.over == "objects"
     assert result.intervals.of("object_median_mm") is None
 
@@ -151,22 +177,37 @@ def test_result_carries_intervals_objects_and_seeds(make):
 def test_one_object_has_no_interval(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset, split="train", noise_mm=1.0)
     result = evaluate(folder, dataset, "train")
-    assert result.intervals.object_mae_mm == [None, None] and result.intervals.of("object_mae_mm") is None
+    assert (
+        result.intervals.object_mae_mm == [None, None]
+        and result.intervals.of("object_mae_mm") is None
+    )
 
 
 @pytest.mark.parametrize(
     "path, value, message",
     [
         ("intervals.object_mae_mm.0", 0.5, r"intervals\.object_mae_mm\.0 does not follow"),
-        ("per_object.0.metrics.object_mae_mm", 0.5, r"per_object\.0\.metrics\.object_mae_mm does not follow"),
-        ("per_object.0.spread.object_mae_mm", 0.5, r"per_object\.0\.spread\.object_mae_mm does not follow"),
+        (
+            "per_object.0.metrics.object_mae_mm",
+            0.5,
+            r"per_object\.0\.metrics\.object_mae_mm does not follow",
+        ),
+        (
+            "per_object.0.spread.object_mae_mm",
+            0.5,
+            r"per_object\.0\.spread\.object_mae_mm does not follow",
+        ),
         ("seeds.bootstrap", 1, r"seeds\.bootstrap does not follow"),
         ("bootstrap.resamples", 10, r"bootstrap\.resamples does not follow"),
         ("per_sample.0.object_bias_mm", -99.0, "bias or shift-free MAE is above the MAE"),
         ("per_sample.0.object_median_mm", 99.0, "out of order"),
         ("per_sample.0.object_p95_mm", None, "null all together"),
         ("mode", "paper", r"dataset\.content: expected hashes of test/depth, got"),
-        ("target", "depth_exact", r"dataset\.content: expected hashes of test/depth_exact, test/flags"),
+        (
+            "target",
+            "depth_exact",
+            r"dataset\.content: expected hashes of test/depth_exact, test/flags",
+        ),
         ("environment.code_sha256", "x", "code_sha256"),
     ],
 )
@@ -182,7 +223,10 @@ def test_comparison_is_paired_and_says_so(make, tmp_path):
     comparison = compare(read_result(first), read_result(second))
     rows = [row.differences["object_mae_mm"] for row in comparison.per_sample]
     first_rows, second_rows = (read_json(p)["per_sample"] for p in (first, second))
-    assert rows == [y["object_mae_mm"] - x["object_mae_mm"] for x, y in zip(first_rows, second_rows, strict=True)]
+    assert rows == [
+        y["object_mae_mm"] - x["object_mae_mm"]
+        for x, y in zip(first_rows, second_rows, strict=True)
+    ]
     main_difference = comparison.differences["object_mae_mm"]
     assert main_difference.mean_mm == pytest.approx(np.mean(rows)) and main_difference.lower == 4
     assert main_difference.distinguishable
@@ -199,14 +243,19 @@ def test_comparison_is_paired_and_says_so(make, tmp_path):
 def test_a_comparison_with_0_in_its_interval(make, dataset, tmp_path):
     first = make("one", noise_mm=1.0, name="One")
     folder = write_predictions(tmp_path / "two", dataset, noise_mm=1.0, name="Two")
-    for number, sample in enumerate(dataset.samples("test")):  # better on an object, worse on the other
+    for number, sample in enumerate(
+        dataset.samples("test")
+    ):  # better on an object, worse on the other
         depth = np.load(folder / f"{sample}.npy")
         np.save(folder / f"{sample}.npy", depth + np.float32(1.0 if number < 2 else -0.5))
     write_result(evaluate(folder, dataset), tmp_path / "two.json")
     comparison = compare(read_result(first), read_result(tmp_path / "two.json"))
     assert not comparison.differences["object_mae_mm"].distinguishable
     assert "can't be distinguished" in comparison.sentence and "holds 0" in comparison.sentence
-    assert "the same two-sided MAE in all 4 samples" in compare(read_result(first), read_result(first)).sentence
+    assert (
+        "the same two-sided MAE in all 4 samples"
+        in compare(read_result(first), read_result(first)).sentence
+    )
 
 
 def test_results_of_other_data_are_not_compared(make, dataset, tmp_path):
@@ -215,7 +264,10 @@ def test_results_of_other_data_are_not_compared(make, dataset, tmp_path):
     folder = write_predictions(tmp_path / "two", dataset, uses_ground_truth_range=True)
     write_result(evaluate(folder, dataset, target="depth_exact"), second)
     message = refusal(fpp_eval, "compare", first, second)
-    assert "target: depth against depth_exact" in message and "track: metric against oracle range" in message
+    assert (
+        "target: depth against depth_exact" in message
+        and "track: metric against oracle range" in message
+    )
 
 
 def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
@@ -226,7 +278,10 @@ def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
     depth = np.load(folder / f"{sample}.npy")
     np.save(folder / f"{sample}.npy", depth + np.float32(0.001))  # as another processor adds
     output = printed(fpp_eval, *command)
-    assert output.startswith("the same within what processors change: ") and "0.01% of the pixels" in output
+    assert (
+        output.startswith("the same within what processors change: ")
+        and "0.01% of the pixels" in output
+    )
     np.save(folder / f"{sample}.npy", depth + np.float32(1.0))
     assert fpp_eval(*command) == 1
     output = capsys.readouterr().out
@@ -237,7 +292,10 @@ def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
     write_predictions(folder, dataset, noise_mm=2.0, name="Another name", frames_used=[0, 1])
     capsys.readouterr()
     assert fpp_eval(*command) == 1
-    assert "submission.name" in (output := capsys.readouterr().out) and "submission.frames_used" in output
+    assert (
+        "submission.name" in (output := capsys.readouterr().out)
+        and "submission.frames_used" in output
+    )
     (folder / f"{sample}.npy").unlink()
     assert fpp_eval(*command) == 2
 

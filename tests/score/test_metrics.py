@@ -1,4 +1,5 @@
-"""A metric is one entry: a toy metric is in results, schema, reports and leaderboard; PROTOCOL.md has all."""
+"""A metric is one entry: a toy metric is in results, schema, reports and leaderboard; PROTOCOL.md
+has all."""
 
 import subprocess
 import sys
@@ -9,7 +10,14 @@ from conftest import read_json
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench import evaluation
-from fpp_ml_bench.evaluation.metrics import BOUNDS, HEADLINE, METRICS, UNCERTAINTY, protocol_table, sort_keys
+from fpp_ml_bench.evaluation.metrics import (
+    BOUNDS,
+    HEADLINE,
+    METRICS,
+    UNCERTAINTY,
+    protocol_table,
+    sort_keys,
+)
 
 TOY = """
 import json, sys
@@ -57,13 +65,15 @@ def scored(tmp_path_factory):
     folder = tmp_path_factory.mktemp("toy")
     dataset = make_dataset(folder / "data")
     predictions = [
-        write_predictions(folder / name, dataset, noise_mm=2.0 + n, name=name) for n, name in enumerate("ab")
+        write_predictions(folder / name, dataset, noise_mm=2.0 + n, name=name)
+        for n, name in enumerate("ab")
     ]
     return folder, dataset, predictions
 
 
 def test_a_toy_metric_is_one_entry(scored):
-    """In a fresh interpreter: results are made of the entries that there are when they are first imported."""
+    """In a fresh interpreter: results are made of the entries that there are when they are first
+    imported."""
     from fpp_ml_bench.evaluation.result.file import write_result
     from fpp_ml_bench.evaluation.score.evaluator import evaluate
 
@@ -73,7 +83,9 @@ def test_a_toy_metric_is_one_entry(scored):
     done = subprocess.run([sys.executable, "-c", TOY, *paths], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     toy = read_json(folder / "new.json")["metrics"]["toy_mm"]
-    heads, _, *rows = (line for line in (folder / "table.md").read_text().splitlines() if line.startswith("|"))
+    heads, _, *rows = (
+        line for line in (folder / "table.md").read_text().splitlines() if line.startswith("|")
+    )
     column = [cell.strip() for cell in heads.split("|")].index("Toy")
     assert [row.split("|")[column].strip() for row in rows[:2]] == [f"{toy:.3f}", "-"]
     assert "Toy" in done.stdout.partition("BOARD")[2]
@@ -90,6 +102,8 @@ def test_entries_are_what_files_and_ranks_rest_on():
     """The keys that every result has stay where they are; whatever comes later may be left out."""
     optional = [metric.optional for metric in METRICS.values()]
     assert optional == sorted(optional) and optional.count(False) == 28
-    assert list(HEADLINE) == list(METRICS)[:6] and all(METRICS[key].unit == "mm" for key in HEADLINE)
+    assert list(HEADLINE) == list(METRICS)[:6] and all(
+        METRICS[key].unit == "mm" for key in HEADLINE
+    )
     assert {key for bound in BOUNDS for key in bound[:2]} <= set(METRICS)
     assert {"object_valid_mae_mm", "object_bias_mm"}.isdisjoint(sort_keys())

@@ -1,4 +1,5 @@
-"""A whole evaluation against one in extended precision that shares no code with it, and the perfect prediction."""
+"""A whole evaluation against one in extended precision that shares no code with it, and the perfect
+prediction."""
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ SIZE = (48, 56)
 
 
 def flagged(depth):
-    """Every seventh row of the object unlit, every ninth column mixed, every 11th saturated, every 8th row weakly lit,
-    and a flag that is not void."""
+    """Every seventh row of the object unlit, every ninth column mixed, every 11th saturated, every
+    8th row weakly lit, and a flag that is not void."""
     flags = np.full(depth.shape, 8, np.uint8)
     flags[::7][depth[::7] > 0] |= 1
     flags[:, ::9] |= 2
@@ -28,7 +29,8 @@ def dataset(tmp_path_factory):
 
 
 def maps_of(dataset, sample, target):
-    """Target, void pixels and the depth of those lit too weakly (0 elsewhere, or without an exact target)."""
+    """Target, void pixels and the depth of those lit too weakly (0 elsewhere, or without an exact
+    target)."""
     depth, flags = dataset.depth_mm(sample), dataset.flags(sample)
     exact = dataset.depth_mm(sample, "depth_exact")
     if target == "depth":
@@ -60,7 +62,9 @@ def assert_close(computed, expected, keys):
 
 def averages(rows, average):
     """The average over those of some rows that have a score."""
-    scores = {key: [row[key] for row in rows if row.get(key) is not None] for key in METRICS | UNCERTAINTY}
+    scores = {
+        key: [row[key] for row in rows if row.get(key) is not None] for key in METRICS | UNCERTAINTY
+    }
     return {key: average(values) for key, values in scores.items() if values}
 
 
@@ -70,7 +74,9 @@ def test_every_score_of_an_evaluation(target, dataset, tmp_path):
     result = evaluate(folder, dataset, target=target)
     rows, stated, errors = {}, {}, []
     for row in result.per_sample:
-        predicted, sigma = (np.load(folder / f"{row.sample}{suffix}") for suffix in (".npy", ".sigma.npy"))
+        predicted, sigma = (
+            np.load(folder / f"{row.sample}{suffix}") for suffix in (".npy", ".sigma.npy")
+        )
         true, void, unlit = maps_of(dataset, row.sample, target)
         rows[row.sample] = sample_scores(predicted, true, 3, void, unlit, 300)
         stated[row.sample] = sigma_scores(predicted, true, sigma, void, 300)
@@ -103,7 +109,11 @@ def test_the_perfect_prediction_scores_0(mode, target, dataset, tmp_path):
         assert result.metrics.object_rmse_mm == 0
         return
     for scores in (result.metrics, result.median, result.pooled, *result.per_sample):
-        errors = {value for key, value in scores.model_dump().items() if key.endswith(("_mm", "invented_share"))}
+        errors = {
+            value
+            for key, value in scores.model_dump().items()
+            if key.endswith(("_mm", "invented_share"))
+        }
         assert errors - {None} == {0.0}
     uncertainty = result.uncertainty.metrics.model_dump()
     assert {uncertainty[key] for key in UNCERTAINTY if key.startswith(("ause", "sure"))} == {0.0}

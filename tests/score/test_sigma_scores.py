@@ -1,4 +1,5 @@
-"""Scores of a stated uncertainty: against an independent computation in extended precision, and on known predictors."""
+"""Scores of a stated uncertainty: against an independent computation in extended precision, and on
+known predictors."""
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from fpp_ml_bench.evaluation.score.verification import Verified, differences
 
 
 def gaussian(stated=1.0, pixels=(300, 400)):
-    """A target, and a prediction whose errors are Gaussian with the sigma that it states, times ``stated``."""
+    """A target, and a prediction whose errors are Gaussian with the sigma that it states, times
+    ``stated``."""
     rng = np.random.default_rng(5)
     target, sigma = np.full(pixels, 1800.0), rng.uniform(0.5, 4.0, pixels)
     return target + sigma * rng.normal(size=pixels), target, stated * sigma
@@ -28,15 +30,23 @@ def test_a_calibrated_predictor_gets_its_nominal_coverage_and_a_lying_one_does_n
     assert lying.scores["nll"] > honest.scores["nll"] + 1
     # Sparsification asks for the order of the sigmas only, and the lie does not change it.
     assert lying.scores["ause_mae_mm"] == pytest.approx(honest.scores["ause_mae_mm"], rel=1e-12)
-    assert 0 < honest.scores["ause_mae_mm"] < score_sigma(*gaussian()[:2], np.ones((300, 400))).scores["ause_mae_mm"]
+    assert (
+        0
+        < honest.scores["ause_mae_mm"]
+        < score_sigma(*gaussian()[:2], np.ones((300, 400))).scores["ause_mae_mm"]
+    )
     assert honest.scores["sure_rmse_mm"] < honest.curves["rmse_mm"][0]
 
 
 def test_a_perfect_predictor_scores_0_and_knowing_its_errors_leaves_no_area():
     target = gaussian()[1]
     perfect = score_sigma(target, target, np.ones_like(target)).scores
-    assert {perfect[key] for key in ("ause_mae_mm", "ause_rmse_mm", "sure_mae_mm", "sure_rmse_mm")} == {0.0}
-    assert {perfect[f"coverage_{percent}"] for percent in COVERED} == {1.0} and perfect["unstated_share"] == 0.0
+    assert {
+        perfect[key] for key in ("ause_mae_mm", "ause_rmse_mm", "sure_mae_mm", "sure_rmse_mm")
+    } == {0.0}
+    assert {perfect[f"coverage_{percent}"] for percent in COVERED} == {1.0} and perfect[
+        "unstated_share"
+    ] == 0.0
     prediction, target, _ = gaussian()
     knowing = score_sigma(prediction, target, np.abs(prediction - target)).scores
     assert knowing["ause_mae_mm"] == knowing["ause_rmse_mm"] == 0.0
@@ -45,8 +55,14 @@ def test_a_perfect_predictor_scores_0_and_knowing_its_errors_leaves_no_area():
 def test_nothing_stated_and_no_object_have_no_score():
     prediction, target, sigma = gaussian(pixels=(20, 20))
     silent = score_sigma(prediction, target, 0 * sigma)
-    assert silent.observed is None and silent.scores["coverage_68"] is None and silent.scores["unstated_share"] == 1.0
-    assert score_sigma(0 * prediction, target, sigma).scores["unstated_share"] == 1.0  # no depth, so nothing is stated
+    assert (
+        silent.observed is None
+        and silent.scores["coverage_68"] is None
+        and silent.scores["unstated_share"] == 1.0
+    )
+    assert (
+        score_sigma(0 * prediction, target, sigma).scores["unstated_share"] == 1.0
+    )  # no depth, so nothing is stated
     assert {*score_sigma(prediction, 0 * target, sigma).scores.values()} == {None}
     with pytest.raises(PredictionError, match="sigma: expected a map of"):
         score_sigma(prediction, target, sigma.T[:5])
@@ -60,7 +76,10 @@ def scored(tmp_path_factory):
     for number, sample in enumerate(dataset.samples("test")):
         rng, depth = np.random.default_rng(number), dataset.depth_mm(sample)
         sigma = rng.uniform(0.5, 4, depth.shape).astype(np.float32)
-        np.save(predictions / f"{sample}.npy", np.where(depth > 0, depth + sigma * rng.normal(size=depth.shape), 0.0))
+        np.save(
+            predictions / f"{sample}.npy",
+            np.where(depth > 0, depth + sigma * rng.normal(size=depth.shape), 0.0),
+        )
         np.save(predictions / f"{sample}.sigma.npy", sigma)
     write_description(predictions)
     return dataset, predictions, evaluate(predictions, dataset)

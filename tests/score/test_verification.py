@@ -15,7 +15,11 @@ OTHER_ROW = ("predictions_sha256", "a" * 64, "b" * 64)
         [OTHER, ("mug_A0: object_mae_mm", 1.2, 1.4)],  # a pixel in 10,000, as far as the range goes
         [OTHER, ("mug_A0: object_rmse_mm", 14.0, 25.0)],  # squares add up
         [OTHER, ("mug_A0: object_max_mm", 300.0, 1800.0)],
-        [OTHER_ROW, ("per_object.3.background_mae_mm", 2.485, 2.431), ("intervals.object_mae_mm.0", 1.0, 1.01)],
+        [
+            OTHER_ROW,
+            ("per_object.3.background_mae_mm", 2.485, 2.431),
+            ("intervals.object_mae_mm.0", 1.0, 1.01),
+        ],
         [OTHER_ROW, ("metrics.object_mae_mm", 1.2, 1.25), ("uncertainty.nll", 1.0, 1.002)],
         [OTHER, ("uncertainty.per_sample.mug_A0.sigma_mean_mm", 1.0, 1.1)],
     ],

@@ -12,7 +12,8 @@ from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
 
 
 def flagged(depth):
-    """Unlit: four rows through the disk. Mixed: its left border and the background beside it. Interreflection: all."""
+    """Unlit: four rows through the disk. Mixed: its left border and the background beside it.
+    Interreflection: all."""
     flags = np.full(depth.shape, Flag.INTERREFLECTION, np.uint8)
     flags[14:18][depth[14:18] > 0] |= np.uint8(Flag.UNLIT)
     border = (depth > 0) != np.roll(depth > 0, 1, axis=1)
@@ -33,7 +34,10 @@ def test_only_unlit_and_mixed_are_void():
 
 def test_surface_that_was_not_decoded_is_void_too():
     flags = np.array([0, 0, 0, Flag.MIXED], np.uint8)
-    depth_mm, exact_mm = np.array([1800.0, 0.0, 0.0, 1800.0]), np.array([1800.5, 1800.5, 0.0, 1800.5])
+    depth_mm, exact_mm = (
+        np.array([1800.0, 0.0, 0.0, 1800.0]),
+        np.array([1800.5, 1800.5, 0.0, 1800.5]),
+    )
     assert void_pixels(flags, depth_mm, exact_mm).tolist() == [False, True, False, True]
 
 
@@ -41,7 +45,9 @@ def test_the_papers_sets_know_no_void(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset, noise_mm=2.0)
     result = evaluate(folder, dataset, mode="paper")
     for row in result.per_sample:
-        scores = score_sample(np.load(folder / f"{row.sample}.npy"), dataset.depth_mm(row.sample)).metrics()
+        scores = score_sample(
+            np.load(folder / f"{row.sample}.npy"), dataset.depth_mm(row.sample)
+        ).metrics()
         assert [getattr(row, key) for key in HEADLINE] == [scores[key] for key in HEADLINE]
         assert row.void_pixels is None and row.void_share is None
     optional = {key for key, metric in METRICS.items() if metric.optional}
@@ -55,7 +61,11 @@ def test_unlit_pixels_are_scored_against_their_exact_depth(dataset, tmp_path):
         np.save(path, np.where(exact > 0, exact + np.float32(3), np.load(path)))
     result = evaluate(folder, dataset, target="depth_exact")
     metrics = result.metrics
-    assert (metrics.unlit_mae_mm, metrics.unlit_rmse_mm, metrics.unlit_valid_mae_mm) == (3.0, 3.0, 3.0)
+    assert (metrics.unlit_mae_mm, metrics.unlit_rmse_mm, metrics.unlit_valid_mae_mm) == (
+        3.0,
+        3.0,
+        3.0,
+    )
     assert metrics.unlit_missing_share == 0.0 and metrics.object_mae_mm == 0.5
     assert "Unlit pixels: MAE 3.000" in result_table(result).renderables[2].plain
 
@@ -63,4 +73,6 @@ def test_unlit_pixels_are_scored_against_their_exact_depth(dataset, tmp_path):
 def test_data_without_flags_have_none(tmp_path):
     data = make_dataset(tmp_path / "data", exact=False)
     result = evaluate(write_predictions(tmp_path / "p", data), data)
-    assert result.metrics.void_share == 0.0 and {row.void_pixels for row in result.per_sample} == {0}
+    assert result.metrics.void_share == 0.0 and {row.void_pixels for row in result.per_sample} == {
+        0
+    }

@@ -89,14 +89,21 @@ def test_an_error_of_the_package_is_a_refusal():
         raise DecodeError("too dim")
 
     (row,) = run_cases([case(refused, "refusal")])
-    assert row.verdict == "flagged" and row.outcome == Outcome(None, flagged_share=1.0, note="too dim")
+    assert row.verdict == "flagged" and row.outcome == Outcome(
+        None, flagged_share=1.0, note="too dim"
+    )
     assert run_cases([case(refused)])[0].against == "refused what can be computed: too dim"
 
 
 def naive_float32(errors):
     """MAE and RMSE by a running float32 sum."""
-    total, squares = np.cumsum(np.abs(errors), dtype=np.float32)[-1], np.cumsum(errors**2, dtype=np.float32)[-1]
-    return ErrorStats(errors.size, float(total) / errors.size, float(np.sqrt(squares / errors.size)))
+    total, squares = (
+        np.cumsum(np.abs(errors), dtype=np.float32)[-1],
+        np.cumsum(errors**2, dtype=np.float32)[-1],
+    )
+    return ErrorStats(
+        errors.size, float(total) / errors.size, float(np.sqrt(squares / errors.size))
+    )
 
 
 def break_metrics(monkeypatch):
@@ -113,7 +120,9 @@ def break_arctangent(monkeypatch):
 
 
 def break_interval(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.frames.minus_atan2", lambda y, x: -np.arctan2(y, x))
+    monkeypatch.setattr(
+        "fpp_ml_bench.baselines.stability.frames.minus_atan2", lambda y, x: -np.arctan2(y, x)
+    )
     return cases_of("order", "arctangent")
 
 
@@ -123,7 +132,9 @@ def break_triangulation(monkeypatch):
         bottom = u - np.float32(device.cx) - np.float32(device.fx) * x
         return (np.float32(device.fx * rig.t[0]) / bottom).astype(float) * 1000
 
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.geometry.depth_from_coordinate", in_single)
+    monkeypatch.setattr(
+        "fpp_ml_bench.baselines.stability.geometry.depth_from_coordinate", in_single
+    )
     return [
         member
         for member in cases_of("triangulation", "baseline and range")
@@ -160,7 +171,9 @@ def break_guard(monkeypatch):
 
 
 def break_lens(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.optics.pinhole._radial_start", lambda x, y, _: (x.copy(), y.copy()))
+    monkeypatch.setattr(
+        "fpp_ml_bench.optics.pinhole._radial_start", lambda x, y, _: (x.copy(), y.copy())
+    )
     missed = {"k1": 0.6, "k2": 0.9, "k3": -0.3, "p1": 0.0}
     return [member for member in cases_of("rig", "lens inverse") if member.parameters == missed]
 
@@ -188,13 +201,17 @@ def test_every_group_has_cases_that_say_what_they_are():
     assert len({(member.group, member.name) for member in cases}) == len(cases)
     for member in cases:
         assert member.computes and member.reference and member.predicts and member.unit
-    assert any(member.heavy for member in cases) and not any(member.heavy for member in all_cases(quick=True))
+    assert any(member.heavy for member in cases) and not any(
+        member.heavy for member in all_cases(quick=True)
+    )
     with pytest.raises(StabilityError, match="unknown group 'chance'"):
         all_cases(["chance"])
 
 
 def test_the_report_says_what_failed(tmp_path):
-    rows = run_cases([*cases_of("order", "arctangent"), case(lambda: Outcome(2.0, 1.0)), failing_case()])
+    rows = run_cases(
+        [*cases_of("order", "arctangent"), case(lambda: Outcome(2.0, 1.0)), failing_case()]
+    )
     data, picture = write_report(rows, tmp_path / "out")
     content = json.loads(data.read_text(encoding="utf-8"))
     assert content == json.loads(json.dumps(document(rows)))

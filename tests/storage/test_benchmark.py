@@ -37,7 +37,9 @@ def test_the_facts_are_of_the_presets_objects():
     for benchmark in BENCHMARKS:
         settings = preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
         splits = {name.partition("/")[0] for name in benchmark.content}
-        objects = [name for split in splits for name in benchmark.counts(split, "standard", "depth")]
+        objects = [
+            name for split in splits for name in benchmark.counts(split, "standard", "depth")
+        ]
         assert sorted(objects) == sorted(settings.objects), benchmark.name
         for split, mode, target in product(splits, ("standard", "paper"), ("depth", "depth_exact")):
             for counts in benchmark.counts(split, mode, target).values():
@@ -48,7 +50,8 @@ def test_the_facts_are_of_the_presets_objects():
 
 
 def test_scenes_are_the_same_whatever_is_projected():
-    """Exact depth and flags, and so void, follow from scene and light alone: one table for every code."""
+    """Exact depth and flags, and so void, follow from scene and light alone: one table for every
+    code."""
     named = {benchmark.name: benchmark for benchmark in BENCHMARKS}
     for paper, crossed in (
         ("full", "crossed"),
@@ -57,35 +60,56 @@ def test_scenes_are_the_same_whatever_is_projected():
         ("test-hard", "test-crossed-hard"),
     ):
         first, second = named[f"fpp-bench-{paper}"], named[f"fpp-bench-{crossed}"]
-        truth = {key: digest for key, digest in first.content.items() if key in ("test/depth_exact", "test/flags")}
+        truth = {
+            key: digest
+            for key, digest in first.content.items()
+            if key in ("test/depth_exact", "test/flags")
+        }
         assert len(truth) == 2 and truth.items() <= second.content.items()
         assert benchmark_of(truth).size == first.size
-        assert first.counts("test", "standard", "depth_exact") == second.counts("test", "standard", "depth_exact")
-        assert first.content["test/depth"] != second.content["test/depth"], "decoded from other frames"
+        assert first.counts("test", "standard", "depth_exact") == second.counts(
+            "test", "standard", "depth_exact"
+        )
+        assert first.content["test/depth"] != second.content["test/depth"], (
+            "decoded from other frames"
+        )
 
 
 def test_a_part_of_a_benchmark_is_that_benchmark():
     full = BENCHMARKS[0].content
-    part = {name: digest for name, digest in full.items() if name in ("test/frame_00", "test/depth", "test/flags")}
+    part = {
+        name: digest
+        for name, digest in full.items()
+        if name in ("test/frame_00", "test/depth", "test/flags")
+    }
     assert benchmark_of(part) is BENCHMARKS[0]
     assert benchmark_of({**part, "test/depth": "0" * 32}) is None
 
 
 def test_a_result_of_other_objects_or_pixels_is_known_to_be_none():
-    content = {name: digest for name, digest in BENCHMARKS[0].content.items() if name.startswith("test/depth")}
+    content = {
+        name: digest
+        for name, digest in BENCHMARKS[0].content.items()
+        if name.startswith("test/depth")
+    }
     counts = BENCHMARKS[0].counts("test", "standard", "depth")
     rules = content, "test", "depth", "standard"
     assert known_problem(*rules, counts) is None
     name, first = next(iter(counts.items()))
     for changed, said in (
-        ({**counts, name: first._replace(samples=5)}, f"has 6 samples of '{name}', this file says 5"),
+        (
+            {**counts, name: first._replace(samples=5)},
+            f"has 6 samples of '{name}', this file says 5",
+        ),
         ({**counts, name: first._replace(void_px=first.void_px + 1)}, "void pixels"),
         ({**counts, name: first._replace(object_px=1)}, "object pixels"),
         ({**counts, "ball": first}, "has no object 'ball'"),
         ({key: counts[key] for key in counts if key != name}, f"has the object '{name}'"),
     ):
         assert said in known_problem(*rules, changed)
-    assert known_problem({"test/depth": "0" * 32}, *rules[1:], {}) is None, "nothing is known of other data"
+    assert known_problem({"test/depth": "0" * 32}, *rules[1:], {}) is None, (
+        "nothing is known of other data"
+    )
 
 
 @pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda b: b.name)
@@ -94,7 +118,12 @@ def test_settings_of_a_benchmark_with_other_bytes_are_a_warning(benchmark):
         preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
     ).manifest  # no rows yet: other bytes
     assert intended_benchmark(manifest) is benchmark
-    assert intended_benchmark(replace(manifest, settings={**manifest.settings, "frames": "single_shot"})) is benchmark
+    assert (
+        intended_benchmark(
+            replace(manifest, settings={**manifest.settings, "frames": "single_shot"})
+        )
+        is benchmark
+    )
     as_expected, sentence = benchmark_sentence(manifest)
     assert not as_expected and benchmark.title in sentence
 
@@ -119,14 +148,25 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     known = replace(BENCHMARKS[0], name="fpp-bench-tiny")
     monkeypatch.setattr(module, "BENCHMARKS", (known,))
     monkeypatch.setattr(module, "FACTS", tmp_path)
-    (tmp_path / "fpp-bench-tiny.json").write_text(json.dumps({"content": manifest.content, "counts": {}}))
-    monkeypatch.setattr("fpp_ml_bench.loaders.render.scene.preset_settings", lambda preset, size, light, rig: settings)
+    (tmp_path / "fpp-bench-tiny.json").write_text(
+        json.dumps({"content": manifest.content, "counts": {}})
+    )
+    monkeypatch.setattr(
+        "fpp_ml_bench.loaders.render.scene.preset_settings",
+        lambda preset, size, light, rig: settings,
+    )
     assert main(["verify", str(tmp_path / "data")]) == 0
     assert "benchmark: this is fpp-bench-tiny version 2" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "data"), "--json", "-"]) == 0
-    assert json.loads(capsys.readouterr().out)["benchmark"] == {"name": "fpp-bench-tiny", "version": 2}
+    assert json.loads(capsys.readouterr().out)["benchmark"] == {
+        "name": "fpp-bench-tiny",
+        "version": 2,
+    }
     monkeypatch.setattr(module, "BENCHMARKS", (replace(known, name="fpp-bench-other"),))
     assert main(["verify", str(tmp_path / "data")]) == 0
     output = capsys.readouterr()
-    assert "warning: built with the settings of fpp-bench-other version 2, but not its content" in output.err
+    assert (
+        "warning: built with the settings of fpp-bench-other version 2, but not its content"
+        in output.err
+    )
     assert "benchmark" not in output.out

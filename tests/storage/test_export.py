@@ -1,4 +1,5 @@
-"""Exports: the published tree, which imports back bit by bit, and Parquet that plain ``datasets`` opens."""
+"""Exports: the published tree, which imports back bit by bit, and Parquet that plain ``datasets``
+opens."""
 
 import shutil
 from pathlib import Path
@@ -64,24 +65,35 @@ def test_files_and_variables_are_those_of_the_published_layout(opened, tree):
         for removed in ("", "bgremoved_")
         for variant in ("raw", "global_normalized", "individual_normalized")
     ]
-    assert sorted(path.name for path in (tree / TRAINING).iterdir()) == sorted([*folders, "info_depth_params"])
+    assert sorted(path.name for path in (tree / TRAINING).iterdir()) == sorted(
+        [*folders, "info_depth_params"]
+    )
     for split, samples in opened.splits.items():
         for folder in folders:
             for kind, suffix in (("fringe", "png"), ("depth", "mat")):
-                names = {path.name for path in (tree / TRAINING / folder / NAMES[split] / kind).iterdir()}
+                names = {
+                    path.name for path in (tree / TRAINING / folder / NAMES[split] / kind).iterdir()
+                }
                 assert names == {f"{sample}.{suffix}" for sample in samples}
     depth, frame = opened.depth_mm(SAMPLE).astype(np.float64), opened.frame(SAMPLE, 0)
     low, high = depth[depth > 0].min(), depth.max()
     expected = {
         "raw": ("depthMap", depth),
         "global_normalized": ("depthMapMeters", depth / 1000),
-        "individual_normalized": ("depthMapNormalized", np.where(depth > 0, (depth - low) / (high - low), 0)),
+        "individual_normalized": (
+            "depthMapNormalized",
+            np.where(depth > 0, (depth - low) / (high - low), 0),
+        ),
     }
     for variant, (variable, values) in expected.items():
         for removed, image in (("", frame), ("bgremoved_", np.where(depth > 0, frame, 0))):
             folder = tree / TRAINING / f"training_data_{removed}depth_{variant}" / "test"
-            np.testing.assert_allclose(scipy.io.loadmat(folder / f"depth/{SAMPLE}.mat")[variable], values, rtol=1e-12)
-            assert np.array_equal(cv2.imread(str(folder / f"fringe/{SAMPLE}.png"), cv2.IMREAD_UNCHANGED), image)
+            np.testing.assert_allclose(
+                scipy.io.loadmat(folder / f"depth/{SAMPLE}.mat")[variable], values, rtol=1e-12
+            )
+            assert np.array_equal(
+                cv2.imread(str(folder / f"fringe/{SAMPLE}.png"), cv2.IMREAD_UNCHANGED), image
+            )
     info = scipy.io.loadmat(tree / TRAINING / f"info_depth_params/test/depth/{SAMPLE}.mat")
     assert (info["depth_min"], info["depth_max"]) == ([[low]], [[high]])
 
@@ -98,13 +110,19 @@ def test_raw_scans_hold_52_frames_and_phases_that_belong_together(opened, tree):
     assert decoded.mean() > 0.8 and np.abs(wrapped).max() <= np.float32(np.pi)
     turns = (unwrapped[decoded].astype(np.float64) - wrapped[decoded]) / (2 * np.pi)
     # Each phase is rounded once to float32, by at most 2**-24 of the largest value.
-    np.testing.assert_allclose(turns, np.round(turns), rtol=0, atol=2**-23 * unwrapped[decoded].max() / (2 * np.pi))
+    np.testing.assert_allclose(
+        turns, np.round(turns), rtol=0, atol=2**-23 * unwrapped[decoded].max() / (2 * np.pi)
+    )
     # The paper's Eq. 2, directly, where the fringes are bright.
     shifts = 2 * np.pi * np.arange(18) / 18
     stack = np.stack(opened.frames(SAMPLE, range(18))).astype(np.float64)
-    expected = -np.arctan2(np.tensordot(np.sin(shifts), stack, 1), np.tensordot(np.cos(shifts), stack, 1))
+    expected = -np.arctan2(
+        np.tensordot(np.sin(shifts), stack, 1), np.tensordot(np.cos(shifts), stack, 1)
+    )
     difference = np.angle(np.exp(1j * (wrapped - expected)))[decoded]
-    assert np.abs(difference).max() < 2**-23 * np.pi  # float64 rounded once to float32, with a factor 2 to spare
+    assert (
+        np.abs(difference).max() < 2**-23 * np.pi
+    )  # float64 rounded once to float32, with a factor 2 to spare
 
 
 def test_two_exports_are_equal_byte_by_byte_whatever_the_threads(opened, tmp_path):
@@ -133,17 +151,32 @@ def swap(first, second):
 
 BROKEN_SCANS = {
     "frame missing": (lambda f: (f / "A_7.png").unlink(), "A_7.png: is missing"),
-    "frame too many": (lambda f: shutil.copy(f / "A_7.png", f / "A_52.png"), "A_52.png: does not belong here"),
+    "frame too many": (
+        lambda f: shutil.copy(f / "A_7.png", f / "A_52.png"),
+        "A_52.png: does not belong here",
+    ),
     "view missing": (lambda f: shutil.rmtree(f), "A60: the raw scan is missing"),
-    "scan without depth": (lambda f: shutil.copytree(f, f.parents[1] / "mug/A60"), "A60: a raw scan without depth"),
+    "scan without depth": (
+        lambda f: shutil.copytree(f, f.parents[1] / "mug/A60"),
+        "A60: a raw scan without depth",
+    ),
     "no view at all": (lambda f: (f.parent / "A45").mkdir(), "A45: does not belong here"),
     "frame of another size": (
         lambda f: write_png(f / "A_9.png", np.zeros((88, 88), np.uint8)),
         "A_9.png: expected 176 x 176 px",
     ),
-    "not the single-shot frame": (lambda f: shutil.copy(f / "A_1.png", f / "A_0.png"), "A_0.png: differs from"),
-    "two frames exchanged": (lambda f: swap(f / "A_20.png", f / "A_23.png"), "A_20.png: expected vertical sinusoid"),
-    "one view in another order": (lambda f: swap(f / "A_50.png", f / "A_51.png"), "has the order paper+white-first"),
+    "not the single-shot frame": (
+        lambda f: shutil.copy(f / "A_1.png", f / "A_0.png"),
+        "A_0.png: differs from",
+    ),
+    "two frames exchanged": (
+        lambda f: swap(f / "A_20.png", f / "A_23.png"),
+        "A_20.png: expected vertical sinusoid",
+    ),
+    "one view in another order": (
+        lambda f: swap(f / "A_50.png", f / "A_51.png"),
+        "has the order paper+white-first",
+    ),
 }
 
 
@@ -169,8 +202,13 @@ def test_another_frame_order_is_detected_undone_and_reported(opened, test_tree, 
     assert dataset.manifest.settings["frame_order"] == order.name
     for index in range(52):
         assert np.array_equal(dataset.frame(SAMPLE, index), opened.frame(SAMPLE, index))
-    assert any("is a vertical fringe, stored in column frame_18" in note for note in import_notes(dataset.manifest))
-    with pytest.raises(LayoutError, match=r"not in frame order paper, it has the order vertical-first\+white-first"):
+    assert any(
+        "is a vertical fringe, stored in column frame_18" in note
+        for note in import_notes(dataset.manifest)
+    )
+    with pytest.raises(
+        LayoutError, match=r"not in frame order paper, it has the order vertical-first\+white-first"
+    ):
         imported(tree, tmp_path / "other", frame_order=FrameOrder().name)
 
 
@@ -190,7 +228,9 @@ def test_plain_datasets_opens_every_configuration_of_the_parquet(opened, parquet
     for split, samples in opened.splits.items():
         part = loaded[split]
         assert part.column_names == columns and part["sample"] == samples
-        assert part.features["frame_00" if 0 in frames else "frame_18"] == datasets.Array2D((176, 176), "uint8")
+        assert part.features["frame_00" if 0 in frames else "frame_18"] == datasets.Array2D(
+            (176, 176), "uint8"
+        )
         assert part.features["depth"] == datasets.Array2D((176, 176), "float32")
         # Only the configuration's own columns went into the cache.
         cached = sum(Path(file["filename"]).stat().st_size for file in part.cache_files)
@@ -217,7 +257,9 @@ def test_no_pixel_is_stored_twice_and_the_default_is_single_shot(opened, parquet
     assert datasets.load_dataset(str(parquet), split="test").column_names[4] == "frame_00"
 
 
-def test_parquet_of_one_split_and_of_another_in_the_same_place_do_not_share_a_cache(opened, tmp_path):
+def test_parquet_of_one_split_and_of_another_in_the_same_place_do_not_share_a_cache(
+    opened, tmp_path
+):
     for split in ("validation", "test"):
         export(opened, tmp_path / "out", ["parquet"], [split])
         loaded = datasets.load_dataset(str(tmp_path / "out"), "single_shot")
@@ -294,7 +336,9 @@ def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp
         ("{data}", "--out", "out", "--parquet", "--split", "val"),
     ],
 )
-def test_bad_input_to_the_command_is_a_message_and_status_2(tiny, tmp_path, monkeypatch, capsys, words):
+def test_bad_input_to_the_command_is_a_message_and_status_2(
+    tiny, tmp_path, monkeypatch, capsys, words
+):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
     assert command("export", *(word.format(data=tiny) for word in words)) == 2

@@ -1,4 +1,5 @@
-"""`load_dataset` and Hugging Face's own tools on the same folder: equal values, and `load_dataset` copies nothing."""
+"""`load_dataset` and Hugging Face's own tools on the same folder: equal values, and `load_dataset`
+copies nothing."""
 
 import json
 import pickle
@@ -46,7 +47,12 @@ def test_every_configuration_has_its_columns_in_order_and_their_values(tiny, ope
     assert len(dataset) == 6 and dataset.split == "validation"
     assert dataset["sample"][:] == opened.splits["validation"]
     row = dataset.with_format("numpy")[3]
-    assert (row["sample"], row["object"], row["view"], row["split"]) == ("mug_A180", "mug", "A180", "validation")
+    assert (row["sample"], row["object"], row["view"], row["split"]) == (
+        "mug_A180",
+        "mug",
+        "A180",
+        "validation",
+    )
     for index in PAPER_SEQUENCE.config(config):
         np.testing.assert_array_equal(row[f"frame_{index:02d}"], opened.frame("mug_A180", index))
         assert dataset.features[f"frame_{index:02d}"] == datasets.Array2D(opened.size, "uint8")
@@ -65,7 +71,9 @@ def test_all_splits_at_once_and_the_lazy_name(tiny, opened):
 
 def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
     """Nine objects of a split are two files of 30 and 24 rows."""
-    folder = make(tmp_path / "set", {"train": OBJECTS[:9], "test": ("power_drill",)}, origin="imported")
+    folder = make(
+        tmp_path / "set", {"train": OBJECTS[:9], "test": ("power_drill",)}, origin="imported"
+    )
     folder_read = DatasetFolder(folder)
     assert [s.rows for s in folder_read.manifest.shards if s.split == "train"] == [30, 24]
     expected = [f"{name}_{view}" for name in OBJECTS[:9] for view in VIEWS]
@@ -82,8 +90,12 @@ def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
         formatted = dataset.with_format("numpy")
         for row in (0, 29, 30, 53):
             for column in ("depth", "depth_exact"):
-                np.testing.assert_array_equal(formatted[row][column], folder_read.depth_mm(expected[row], column))
-            np.testing.assert_array_equal(formatted[row]["frame_00"], folder_read.frame(expected[row], 0))
+                np.testing.assert_array_equal(
+                    formatted[row][column], folder_read.depth_mm(expected[row], column)
+                )
+            np.testing.assert_array_equal(
+                formatted[row]["frame_00"], folder_read.frame(expected[row], 0)
+            )
     alone = SyntheticRows().row(expected[30], *split_sample_name(expected[30]))
     np.testing.assert_array_equal(folder_read.frame(expected[30], 0), alone.frames[0])
     np.testing.assert_array_equal(folder_read.depth_mm(expected[30]), alone.depth_mm)
@@ -98,7 +110,9 @@ def test_memory_is_the_files_own_map(tiny):
         holder = [
             line
             for line in maps
-            if int(line.split("-")[0], 16) <= buffer.address < int(line.split()[0].split("-")[1], 16)
+            if int(line.split("-")[0], 16)
+            <= buffer.address
+            < int(line.split()[0].split("-")[1], 16)
         ]
         assert len(holder) == 1 and str(tiny) in holder[0]
 
@@ -120,7 +134,8 @@ def test_usual_operations(tiny, opened, tmp_path):
     dataset = load_dataset(folder, "vertical", split="train")
     shuffled = dataset.shuffle(seed=3)
     assert (
-        sorted(shuffled["sample"]) == sorted(opened.splits["train"]) and shuffled["sample"][:] != dataset["sample"][:]
+        sorted(shuffled["sample"]) == sorted(opened.splits["train"])
+        and shuffled["sample"][:] != dataset["sample"][:]
     )
     selected = shuffled.select([4, 0])
     for row in selected.with_format("numpy"):
@@ -128,18 +143,26 @@ def test_usual_operations(tiny, opened, tmp_path):
     filtered = dataset.filter(lambda view: view == "A60", input_columns="view")
     assert filtered["sample"][:] == ["bowl_A60", "cork_A60"]
     row = dataset.with_format("torch", columns=["frame_18", "depth"], dtype=torch.float32)[0]
-    assert row["frame_18"].dtype == torch.float32 and row["frame_18"].shape == (TINY_SIZE, TINY_SIZE)
+    assert row["frame_18"].dtype == torch.float32 and row["frame_18"].shape == (
+        TINY_SIZE,
+        TINY_SIZE,
+    )
     again = pickle.loads(pickle.dumps(dataset))
-    np.testing.assert_array_equal(again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"]))
+    np.testing.assert_array_equal(
+        again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"])
+    )
     assert verify(folder) == []  # verify ignores those caches
 
 
 def test_fingerprints_follow_the_data(tiny, tmp_path):
     shutil.copytree(tiny, tmp_path / "moved")
     fingerprint = load_dataset(tiny, "single_shot", split="train")._fingerprint
-    assert load_dataset(tmp_path / "moved", "single_shot", split="train")._fingerprint == fingerprint
+    assert (
+        load_dataset(tmp_path / "moved", "single_shot", split="train")._fingerprint == fingerprint
+    )
     other_fingerprints = {
-        load_dataset(tiny, c, split=s)._fingerprint for c, s in (("all", "train"), ("single_shot", "test"))
+        load_dataset(tiny, c, split=s)._fingerprint
+        for c, s in (("all", "train"), ("single_shot", "test"))
     }
     assert len(other_fingerprints | {fingerprint}) == 3
 
@@ -147,20 +170,25 @@ def test_fingerprints_follow_the_data(tiny, tmp_path):
 @pytest.mark.parametrize(("config", "exact"), [("single_shot", False), ("all", True)])
 def test_schema_is_what_datasets_itself_would_write(config, exact):
     columns = config_columns(PAPER_SEQUENCE, config, exact)
-    expected_features = datasets.Features({name: datasets.Array2D((120, 160), "uint8") for name in columns})
+    expected_features = datasets.Features(
+        {name: datasets.Array2D((120, 160), "uint8") for name in columns}
+    )
     for name in ("sample", "object", "view", "split"):
         expected_features[name] = datasets.Value("string")
     for name in ("depth_min", "depth_max"):
         expected_features[name] = datasets.Value("float32")
     for name in ("depth", "depth_exact") if exact else ("depth",):
         expected_features[name] = datasets.Array2D((120, 160), "float32")
-    # Through a file, as a reader gets it: with `datasets` imported, the extension type comes from the metadata.
+    # Through a file, as a reader gets it: with `datasets` imported, the extension type comes from
+    # the metadata.
     schema, expected = (
         pa.ipc.read_schema(arrow_schema(features(columns, (120, 160))).serialize()),
         expected_features.arrow_schema,
     )
     assert schema.equals(expected)
-    assert json.loads(schema.metadata[b"huggingface"]) == json.loads(expected.metadata[b"huggingface"])
+    assert json.loads(schema.metadata[b"huggingface"]) == json.loads(
+        expected.metadata[b"huggingface"]
+    )
     assert datasets.Features.from_arrow_schema(schema) == expected_features
     assert datasets.Features.from_dict(features(columns, (120, 160))) == expected_features
 
@@ -181,7 +209,9 @@ def test_configuration_that_is_not_stored(tmp_path):
     build(tmp_path / "set", tiny_settings(objects=("cork",), stored="horizontal"), workers=1)
     assert len(load_dataset(tmp_path / "set", "horizontal", split="train")) == 6
     assert list(load_dataset(tmp_path / "set", "single_shot")) == ["train"]
-    with pytest.raises(DatasetError, match=r"'vertical' is not stored.*--config vertical or --config all"):
+    with pytest.raises(
+        DatasetError, match=r"'vertical' is not stored.*--config vertical or --config all"
+    ):
         load_dataset(tmp_path / "set", "vertical", split="train")
     with pytest.raises(DatasetError, match="no such folder"):
         load_dataset(tmp_path / "none")

@@ -16,7 +16,8 @@ SHARDS = [12, 6, 6]
 
 @dataclass(frozen=True)
 class RowsAndMeshes(SyntheticRows):
-    """Rows of noise, and a file for each object as the builder writes; ``stop`` is a split that is never reached."""
+    """Rows of noise, and a file for each object as the builder writes; ``stop`` is a split that is
+    never reached."""
 
     stop: str | None = None
 
@@ -84,7 +85,9 @@ def test_a_url_with_other_files_is_refused(remote, tmp_path):
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_a_cluster_writes_the_same_files_and_goes_on_where_it_died(shared, local, remote, fake_ray, tmp_path):
+def test_a_cluster_writes_the_same_files_and_goes_on_where_it_died(
+    shared, local, remote, fake_ray, tmp_path
+):
     advanced = []
 
     def run(progress=lambda rows: None):
@@ -104,5 +107,8 @@ def test_a_cluster_writes_the_same_files_and_goes_on_where_it_died(shared, local
 def test_a_node_that_does_not_see_the_folder_or_url_says_so(remote, tmp_path):
     plan, made = noise().plans[0], noise()
     for place in (tmp_path, remote):
-        with pytest.raises(BuildError, match="does not find the build there; give a folder that all nodes share, or a"):
+        with pytest.raises(
+            BuildError,
+            match="does not find the build there; give a folder that all nodes share, or a",
+        ):
             ShardWork(made, place).write(plan)

@@ -1,4 +1,5 @@
-"""Crash safety, with real processes, real signals and a really full disk: no partial result, the same bytes at last."""
+"""Crash safety, with real processes, real signals and a really full disk: no partial result, the
+same bytes at last."""
 
 import contextlib
 import errno
@@ -34,12 +35,25 @@ SMALL = {"objects": ("cork",), "stored": "single_shot"}
 
 def build_arguments(folder, *more, objects=TINY_OBJECTS, workers=1):
     size, objects, workers = str(TINY_SIZE), ",".join(objects), str(workers)
-    return ["build", "--out", str(folder), "--size", size, "--objects", objects, "--workers", workers, *more]
+    return [
+        "build",
+        "--out",
+        str(folder),
+        "--size",
+        size,
+        "--objects",
+        objects,
+        "--workers",
+        workers,
+        *more,
+    ]
 
 
 def half_arguments(folder, light):
     """Of the dataset of `half_settings`."""
-    return build_arguments(folder, "--config", "single_shot", "--light", light, objects=("cork", "mug"))
+    return build_arguments(
+        folder, "--config", "single_shot", "--light", light, objects=("cork", "mug")
+    )
 
 
 def start(arguments):
@@ -84,7 +98,8 @@ def group_members(group):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """A folder whose build was stopped in its second shard, and whose lock is free. Copy it before changing it."""
+    """A folder whose build was stopped in its second shard, and whose lock is free. Copy it before
+    changing it."""
     folder, views = tmp_path_factory.mktemp("stopped") / "half", []
     photograph = Studio.photograph
 
@@ -118,7 +133,9 @@ def half_built(stopped, tmp_path):
 
 def half_settings(**changes):
     """Of two objects and one frame, in `DIRECT` light."""
-    return tiny_settings(**{"objects": ("cork", "mug"), "stored": "single_shot", "light": DIRECT, **changes})
+    return tiny_settings(
+        **{"objects": ("cork", "mug"), "stored": "single_shot", "light": DIRECT, **changes}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +209,9 @@ def test_resume_makes_only_what_is_missing(half_built, uninterrupted, monkeypatc
     assert file_bytes(half_built) == uninterrupted
 
 
-@pytest.mark.parametrize("damage", ["flip", "cut", "remove", "mesh", "receipt", "receipt of nothing"])
+@pytest.mark.parametrize(
+    "damage", ["flip", "cut", "remove", "mesh", "receipt", "receipt of nothing"]
+)
 def test_resume_trusts_no_damaged_work(half_built, uninterrupted, damage):
     (shard,) = final_shards(half_built)
     receipt = half_built / ".build" / "train-00000-of-00001.json"
@@ -214,7 +233,9 @@ def test_resume_trusts_no_damaged_work(half_built, uninterrupted, damage):
     assert file_bytes(half_built) == uninterrupted
 
 
-def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_dataset(half_built, uninterrupted):
+def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_dataset(
+    half_built, uninterrupted
+):
     for name in (
         ".README.md.123.tmp",
         "train/.state.json.9.tmp",
@@ -261,13 +282,17 @@ def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, direct
     arguments = half_arguments(half_built, direct_light)
     assert main(arguments) == 0
     assert "complete already" in capsys.readouterr().out
-    assert {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()} == stamps
+    assert {
+        path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()
+    } == stamps
     final_shards(half_built)[0].unlink()
     assert main(arguments) == 2
     assert "missing" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("content", ["file", "folder with files", "dataset of others", "damaged settings"])
+@pytest.mark.parametrize(
+    "content", ["file", "folder with files", "dataset of others", "damaged settings"]
+)
 def test_folders_with_other_content(tmp_path, half_built, content, capsys):
     folder = tmp_path / "out"
     if content == "file":
@@ -277,7 +302,9 @@ def test_folders_with_other_content(tmp_path, half_built, content, capsys):
         (folder / ".build" / "settings.json").write_text("{")
     else:
         folder.mkdir()
-        (folder / ("manifest.json" if content == "dataset of others" else "thesis.tex")).write_text("{}")
+        (folder / ("manifest.json" if content == "dataset of others" else "thesis.tex")).write_text(
+            "{}"
+        )
     with pytest.raises(DatasetError, match=str(folder)):
         build(folder, half_settings(), workers=1)
     if content == "folder with files":
@@ -311,7 +338,9 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
     folder = tmp_path / "set"
     assembly = assembly_of(half_settings())
     broken = Assembly(assembly.plans, die, assembly.manifest, assembly.mesh_folder)
-    with pytest.raises(PoolError, match=r"worker process died .* run the same command again, it resumes"):
+    with pytest.raises(
+        PoolError, match=r"worker process died .* run the same command again, it resumes"
+    ):
         assemble(folder, broken, workers=2)
     assert not (folder / "manifest.json").exists()
     build(folder, half_settings(), workers=1)
@@ -325,7 +354,9 @@ def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted,
     assert wait_for(lambda: list(folder.glob("*/.*.tmp")), process)
     os.killpg(process.pid, signal.SIGTERM)
     errors = process.communicate(timeout=60)[1]
-    assert process.returncode == 143 and errors.endswith("fpp-bench build: stopped; the same command continues\n")
+    assert process.returncode == 143 and errors.endswith(
+        "fpp-bench build: stopped; the same command continues\n"
+    )
     assert "Traceback" not in errors and "resource_tracker" not in errors
     deadline = time.monotonic() + 30  # its helper process may outlive it by a moment
     while group_members(process.pid) and time.monotonic() < deadline:
@@ -348,7 +379,8 @@ def test_full_disk_is_refused_beforehand(tmp_path, capsys):
 
 @pytest.mark.processes
 def test_files_that_can_not_grow(tmp_path, direct_light, uninterrupted):
-    """No space in the middle of a shard, through a limit on file sizes (EFBIG), which needs no privileges."""
+    """No space in the middle of a shard, through a limit on file sizes (EFBIG), which needs no
+    privileges."""
     folder = tmp_path / "set"
     arguments = [*COMMAND, *half_arguments(folder, direct_light)]
     limit = 1_000_000  # bytes; a shard has 1.7 million
@@ -357,7 +389,9 @@ def test_files_that_can_not_grow(tmp_path, direct_light, uninterrupted):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     # Machine code that `uninterrupted` left in the cache is not compiled and written again.
-    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, preexec_fn=no_large_files)
+    done = subprocess.run(
+        arguments, cwd=ROOT, capture_output=True, text=True, preexec_fn=no_large_files
+    )
     assert done.returncode == 2
     assert os.strerror(errno.EFBIG) in done.stderr and "resumes" in done.stderr
     assert "Traceback" not in done.stderr

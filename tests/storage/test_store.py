@@ -47,20 +47,29 @@ def test_depths_are_the_values_of_their_file(tiny, opened):
     path = next(tiny.rglob("train/data-*.arrow"))
     for row in (0, 11):
         sample = opened.splits["train"][row]
-        np.testing.assert_array_equal(opened.depth_mm(sample), plain_arrow(path, "depth", row).astype(np.float32))
+        np.testing.assert_array_equal(
+            opened.depth_mm(sample), plain_arrow(path, "depth", row).astype(np.float32)
+        )
         exact = opened.depth_mm(sample, "depth_exact")
-        np.testing.assert_array_equal(exact, plain_arrow(path, "depth_exact", row).astype(np.float32))
+        np.testing.assert_array_equal(
+            exact, plain_arrow(path, "depth_exact", row).astype(np.float32)
+        )
         assert exact.dtype == np.float32 and opened.frame(sample, 0).dtype == np.uint8
 
 
 def test_a_method_is_given_no_truth_outside_the_training_split(tiny, opened):
     """Not by any name, also in another process; frames, names and what identifies the data stay."""
     given = opened.without_truth()
-    assert given.without_truth() is given and given.fingerprint == opened.fingerprint and given.splits == opened.splits
+    assert (
+        given.without_truth() is given
+        and given.fingerprint == opened.fingerprint
+        and given.splits == opened.splits
+    )
     for seen in (given, pickle.loads(pickle.dumps(given))):
         for look in (seen.depth_mm, seen.target_mm, seen.void, seen.flags, seen.unlit_mm):
             with pytest.raises(
-                DatasetError, match="is truth of the validation split, and methods are given that of the"
+                DatasetError,
+                match="is truth of the validation split, and methods are given that of the",
             ):
                 look("mug_A60")
         with pytest.raises(DatasetError, match="is truth of the test split"):
@@ -68,7 +77,9 @@ def test_a_method_is_given_no_truth_outside_the_training_split(tiny, opened):
         assert set(seen.measured("mug_A60")) == {"sample", "object", "view"}
         for shard in seen.manifest.shards:
             names = [name for name, _ in seen.opened(shard).types]
-            assert shard.split == "train" or not any(name.startswith(("depth", "flags", "cover")) for name in names)
+            assert shard.split == "train" or not any(
+                name.startswith(("depth", "flags", "cover")) for name in names
+            )
         np.testing.assert_array_equal(seen.frame("mug_A60", 20), opened.frame("mug_A60", 20))
         learned = opened.samples("train")[0]
         np.testing.assert_array_equal(seen.depth_mm(learned), opened.depth_mm(learned))
@@ -103,19 +114,32 @@ def test_frames_in_the_order_of_the_indices(opened):
 
 def test_void_is_of_the_decoded_depth_or_of_scene_and_light_alone(opened):
     for sample in opened.samples("all"):
-        depth, exact, flags = opened.depth_mm(sample), opened.depth_mm(sample, "depth_exact"), opened.flags(sample)
+        depth, exact, flags = (
+            opened.depth_mm(sample),
+            opened.depth_mm(sample, "depth_exact"),
+            opened.flags(sample),
+        )
         for column, stored in (("depth", depth), ("depth_exact", exact)):
-            assert np.shares_memory(opened.target_mm(sample, column), stored) and stored.dtype == np.float32
+            assert (
+                np.shares_memory(opened.target_mm(sample, column), stored)
+                and stored.dtype == np.float32
+            )
         unlit_or_mixed = (flags & 3) > 0
-        np.testing.assert_array_equal(opened.void(sample), unlit_or_mixed | ((exact > 0) & (depth == 0)))
-        np.testing.assert_array_equal(opened.void(sample, "depth_exact"), (flags & (1 | 2 | 4 | 16)) > 0)
+        np.testing.assert_array_equal(
+            opened.void(sample), unlit_or_mixed | ((exact > 0) & (depth == 0))
+        )
+        np.testing.assert_array_equal(
+            opened.void(sample, "depth_exact"), (flags & (1 | 2 | 4 | 16)) > 0
+        )
         # What is neither void nor unmeasurable, the full sequence decodes.
         scored = (exact > 0) & ~opened.void(sample, "depth_exact")
         assert (depth[scored] == 0).mean() < 2e-3
 
 
 def test_names_splits_and_what_was_measured(opened):
-    assert opened.samples("all") == [s for split in ("train", "validation", "test") for s in opened.splits[split]]
+    assert opened.samples("all") == [
+        s for split in ("train", "validation", "test") for s in opened.splits[split]
+    ]
     assert opened.split_of_sample("mug_A300") == "validation"
     assert opened.measured("cork_A120")["object"] == "cork"
     assert len(opened.fingerprint) == 64 and opened.has_exact
@@ -158,7 +182,13 @@ def test_errors_of_reading(opened, call, message):
         (lambda p: p.mkdir(), "no manifest.json there"),
         (lambda p: (p / ".build").mkdir(parents=True), "not finished"),
         (lambda p: (p.mkdir(), (p / "manifest.json").write_text("{")), "damaged"),
-        (lambda p: (p.mkdir(), (p / "manifest.json").write_text('{"fingerprint": 1, "schema_version": "9.0"}')), "9.0"),
+        (
+            lambda p: (
+                p.mkdir(),
+                (p / "manifest.json").write_text('{"fingerprint": 1, "schema_version": "9.0"}'),
+            ),
+            "9.0",
+        ),
     ],
 )
 def test_folders_that_are_no_dataset(tmp_path, make, message):
@@ -179,7 +209,9 @@ def test_missing_and_cut_shards_are_noticed_when_opening(copied):
     shard = copied / read_manifest(copied).shards[3].path
     content = shard.read_bytes()
     shard.write_bytes(content[:-1])
-    with pytest.raises(DatasetError, match=f"has {len(content) - 1} bytes, expected {len(content)}"):
+    with pytest.raises(
+        DatasetError, match=f"has {len(content) - 1} bytes, expected {len(content)}"
+    ):
         DatasetFolder(copied)
     shard.unlink()
     with pytest.raises(DatasetError, match="is missing"):
@@ -187,7 +219,9 @@ def test_missing_and_cut_shards_are_noticed_when_opening(copied):
 
 
 def test_same_length_but_no_arrow_is_an_error_not_a_crash(copied):
-    shard = next(s for s in read_manifest(copied).shards if s.split == "train" and s.group == DATA_GROUP)
+    shard = next(
+        s for s in read_manifest(copied).shards if s.split == "train" and s.group == DATA_GROUP
+    )
     path = copied / shard.path
     opened = DatasetFolder(copied)
     path.write_bytes(b"\0" * shard.bytes)
@@ -198,22 +232,36 @@ def test_same_length_but_no_arrow_is_an_error_not_a_crash(copied):
 @pytest.mark.processes
 def test_reading_imports_neither_torch_nor_datasets_nor_pandas(tiny):
     code = (
-        "import sys; from fpp_ml_bench.loaders.storage.store import DatasetFolder; d = DatasetFolder(sys.argv[1]);"
+        "import sys; from fpp_ml_bench.loaders.storage.store import DatasetFolder; d = "
+        "DatasetFolder(sys.argv[1]);"
         "d.depth_mm('mug_A0').sum(); d.frame('mug_A0', 30).sum();"
-        "print([m for m in ('torch', 'datasets', 'pandas', 'scipy', 'trimesh', 'numba') if m in sys.modules])"
+        "print([m for m in ('torch', 'datasets', 'pandas', 'scipy', 'trimesh', 'numba') if m in "
+        "sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(tiny)], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tiny)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout.strip() == "[]"
 
 
 def test_content_is_of_the_decoded_values_and_not_of_the_files(tmp_path, opened):
-    """The same images in other shards, in another order and with other paths have the same content; a changed bit has
-    another, a float that is written as another zero too."""
+    """The same images in other shards, in another order and with other paths have the same content;
+    a changed bit has another, a float that is written as another zero too."""
     image = opened.depth_mm("bowl_A0")
-    assert image_hash(image) == image_hash(np.asfortranarray(image)) == image_hash(image.astype(">f4"))
+    assert (
+        image_hash(image) == image_hash(np.asfortranarray(image)) == image_hash(image.astype(">f4"))
+    )
     assert image_hash(image) != image_hash(image.T) and image_hash(image) != image_hash(-image)
     hashes = {sample: image_hash(opened.depth_mm(sample)) for sample in opened.samples("train")}
-    assert opened.content["train/depth"] == column_hash(hashes) == column_hash(dict(reversed(hashes.items())))
+    assert (
+        opened.content["train/depth"]
+        == column_hash(hashes)
+        == column_hash(dict(reversed(hashes.items())))
+    )
     assert opened.content_hash("train", "depth", hashes) == ("train/depth", column_hash(hashes))
     first, second = list(hashes)[:2]
     swapped = {**hashes, first: hashes[second], second: hashes[first]}
@@ -222,7 +270,13 @@ def test_content_is_of_the_decoded_values_and_not_of_the_files(tmp_path, opened)
     assert set(opened.content) == {
         f"{split}/{column}"
         for split in opened.splits
-        for column in (*(frame.column for frame in opened.sequence.frames), "depth", "depth_exact", "flags", "cover")
+        for column in (
+            *(frame.column for frame in opened.sequence.frames),
+            "depth",
+            "depth_exact",
+            "flags",
+            "cover",
+        )
     }
 
 
@@ -237,7 +291,8 @@ def shard_parts(tmp_path):
 
 
 def changed(path, column, buffer, place, value):
-    """Write another int32 into a buffer of offsets of a column, which pyarrow itself does not look at."""
+    """Write another int32 into a buffer of offsets of a column, which pyarrow itself does not look
+    at."""
     content = bytearray(path.read_bytes())
     memory = pa.py_buffer(bytes(content))
     stored = pa.ipc.open_stream(memory).read_next_batch().column(column).buffers()[buffer]
@@ -272,7 +327,13 @@ def written_anew(path, change, **options):
     "change, options",
     [
         (lambda columns: columns, {"compression": "lz4"}),
-        (lambda columns: {**columns, "depth": pa.nulls(len(columns["depth"]), columns["depth"].type)}, {}),
+        (
+            lambda columns: {
+                **columns,
+                "depth": pa.nulls(len(columns["depth"]), columns["depth"].type),
+            },
+            {},
+        ),
         (lambda columns: {**columns, "depth": columns["sample"].dictionary_encode()}, {}),
         (lambda columns: {**columns, "depth": columns["sample"]}, {}),
         (lambda columns: {**columns, "depth": pa.array([[[[1.0]]]] * len(columns["sample"]))}, {}),

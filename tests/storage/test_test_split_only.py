@@ -26,7 +26,10 @@ def test_it_is_intact_and_says_what_it_is(unseen, capsys):
     (split,) = json.loads(capsys.readouterr().out)["splits"]
     assert (split["split"], split["objects"], split["samples"]) == ("test", 2, 12)
     assert main(["info", str(unseen)]) == 0
-    assert 'split="test"' in (unseen / "README.md").read_text() and "train" not in (unseen / "README.md").read_text()
+    assert (
+        'split="test"' in (unseen / "README.md").read_text()
+        and "train" not in (unseen / "README.md").read_text()
+    )
 
 
 def test_it_loads_as_one_split(unseen):

@@ -1,4 +1,5 @@
-"""`verify` reports every kind of damage and leak, with one finding each, and none on a clean dataset."""
+"""`verify` reports every kind of damage and leak, with one finding each, and none on a clean
+dataset."""
 
 import shutil
 from dataclasses import replace
@@ -38,7 +39,8 @@ def flip(path, share=0.5):
 
 
 def restate(folder, **changes):
-    """Write the manifest again with a right fingerprint, as someone who wants to hide a change would do."""
+    """Write the manifest again with a right fingerprint, as someone who wants to hide a change
+    would do."""
     replace(read_manifest(folder), **changes).write(folder)
 
 
@@ -46,7 +48,9 @@ def reseal(folder, shard):
     """Make the manifest agree with the present bytes of a shard."""
     path = folder / shard.path
     sealed = replace(shard, bytes=path.stat().st_size, xxh3_128=file_hash(path))
-    restate(folder, shards=[sealed if s.path == shard.path else s for s in read_manifest(folder).shards])
+    restate(
+        folder, shards=[sealed if s.path == shard.path else s for s in read_manifest(folder).shards]
+    )
 
 
 def test_clean_datasets_have_no_findings(tiny, clean, capsys):
@@ -90,7 +94,9 @@ def test_cut_missing_and_foreign_files(copied):
     size = cut.stat().st_size
     cut.write_bytes(cut.read_bytes()[:-8])
     gone.unlink()
-    shutil.copy(copied / shard_of(copied, "test").path, copied / "test" / "data-00001-of-00002.arrow")
+    shutil.copy(
+        copied / shard_of(copied, "test").path, copied / "test" / "data-00001-of-00002.arrow"
+    )
     (copied / "frames" / "note.txt").write_text("x")
     findings = verify(copied)
     assert len(findings) == 4
@@ -110,7 +116,9 @@ def test_link_in_place_of_nothing_is_foreign(clean):
 
 
 def test_swapped_shards(clean):
-    validation_path, test_path = (clean / shard_of(clean, split).path for split in ("validation", "test"))
+    validation_path, test_path = (
+        clean / shard_of(clean, split).path for split in ("validation", "test")
+    )
     content = validation_path.read_bytes(), test_path.read_bytes()
     test_path.write_bytes(content[0])
     validation_path.write_bytes(content[1])
@@ -141,7 +149,10 @@ def test_other_columns_under_a_right_checksum(clean):
         table.slice(1),
         table.set_column(7, "depth_min", pa.array(["1"] * 12)),
     ):
-        with pa.OSFile(str(clean / shard.path), "wb") as sink, pa.ipc.new_stream(sink, wrong.schema) as writer:
+        with (
+            pa.OSFile(str(clean / shard.path), "wb") as sink,
+            pa.ipc.new_stream(sink, wrong.schema) as writer,
+        ):
             writer.write_table(wrong)
         reseal(clean, shard)
         (finding,) = verify(clean)
@@ -170,7 +181,9 @@ def test_depths_that_no_sample_may_have(tmp_path, monkeypatch, value, message):
 
 @pytest.mark.parametrize("key", ["sample", "object", "view", "depth_min_mm"])
 def test_labels_that_contradict_the_manifest(clean, key):
-    samples = {split: [dict(row) for row in rows] for split, rows in read_manifest(clean).samples.items()}
+    samples = {
+        split: [dict(row) for row in rows] for split, rows in read_manifest(clean).samples.items()
+    }
     samples["train"][7][key] = samples["train"][8][key] if key != "object" else "bowl"
     restate(clean, samples=samples)
     findings = verify(clean)
@@ -178,7 +191,9 @@ def test_labels_that_contradict_the_manifest(clean, key):
 
 
 def test_sample_named_otherwise_than_its_object(clean):
-    samples = {split: [dict(row) for row in rows] for split, rows in read_manifest(clean).samples.items()}
+    samples = {
+        split: [dict(row) for row in rows] for split, rows in read_manifest(clean).samples.items()
+    }
     samples["test"][0]["object"] = "drill"
     restate(clean, samples=samples)
     assert any("'power_drill_A0'" in f and "said to be" in f for f in verify(clean))
@@ -188,7 +203,9 @@ def test_sample_named_otherwise_than_its_object(clean):
 
 
 def test_object_in_two_splits(tmp_path):
-    folder = make(tmp_path / "set", {"train": ("bowl", "mug"), "validation": ("mug",)}, origin="imported")
+    folder = make(
+        tmp_path / "set", {"train": ("bowl", "mug"), "validation": ("mug",)}, origin="imported"
+    )
     findings = verify(folder)
     assert sum("in two splits" in f and "'mug'" in f for f in findings) >= 1
     assert any("same image stands in two splits: train/mug_A0" in f for f in findings)
@@ -198,7 +215,10 @@ def test_object_in_two_splits(tmp_path):
 def test_image_in_two_splits_under_other_names(tmp_path):
     folder = make(tmp_path / "set", same=(("power_drill_A120", "bowl_A60"),))
     (finding,) = verify(folder)
-    assert finding == "the same image stands in two splits: train/bowl_A60 frame_00, test/power_drill_A120 frame_00"
+    assert (
+        finding
+        == "the same image stands in two splits: train/bowl_A60 frame_00, test/power_drill_A120 frame_00"
+    )
 
 
 def test_image_twice_in_one_split_is_no_leak(tmp_path):
@@ -208,9 +228,12 @@ def test_image_twice_in_one_split_is_no_leak(tmp_path):
 def test_benchmark_object_in_the_wrong_split(tmp_path):
     wrong = {"train": ("power_drill", "bowl"), "test": ("wooden_boards",)}
     assert any(
-        "'power_drill' is in train, the benchmark has it in test" in f for f in verify(make(tmp_path / "a", wrong))
+        "'power_drill' is in train, the benchmark has it in test" in f
+        for f in verify(make(tmp_path / "a", wrong))
     )
-    assert verify(make(tmp_path / "b", wrong, origin="imported")) == []  # a published tree has its own split
+    assert (
+        verify(make(tmp_path / "b", wrong, origin="imported")) == []
+    )  # a published tree has its own split
 
 
 def test_object_without_all_its_views(tmp_path):
@@ -279,5 +302,10 @@ def test_any_flipped_bit_of_the_manifest_is_noticed_or_does_not_concern_the_data
         if changed_manifest.others != manifest.others:
             assert verify(clean)
         harmless += 1
-        assert replace(changed_manifest, generator=manifest.generator, others=manifest.others) == manifest
-    assert harmless < 150  # white space, the generator's name, the entries of files that are looked at themselves
+        assert (
+            replace(changed_manifest, generator=manifest.generator, others=manifest.others)
+            == manifest
+        )
+    assert (
+        harmless < 150
+    )  # white space, the generator's name, the entries of files that are looked at themselves

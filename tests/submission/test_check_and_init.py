@@ -1,4 +1,5 @@
-"""``fpp-eval init`` and ``fpp-eval check``: a description to fill in, and a submission checked without ground truth."""
+"""``fpp-eval init`` and ``fpp-eval check``: a description to fill in, and a submission checked
+without ground truth."""
 
 import re
 
@@ -27,7 +28,10 @@ def test_the_description_to_fill_in_names_every_key_and_each_is_valid(tmp_path):
     every = every.replace("seconds_per_sample: null", "seconds_per_sample: 0.5")
     (tmp_path / "submission.yaml").write_text(every)
     read = read_submission(tmp_path)
-    assert read.model_fields_set == set(Submission.model_fields) and read.learned_from.data == "train-split"
+    assert (
+        read.model_fields_set == set(Submission.model_fields)
+        and read.learned_from.data == "train-split"
+    )
 
 
 def test_a_sound_submission(predictions, dataset, capsys):
@@ -46,11 +50,23 @@ def test_other_forms_are_checked_too(tmp_path, dataset):
 
 
 FAULTS = {
-    "another size": (lambda f: np.save(f / "power_drill_A0.npy", np.ones((40, 32), np.float32)), "expected shape"),
-    "NaN": (lambda f: np.save(f / "power_drill_A0.npy", np.full((32, 40), np.nan, np.float32)), "1280 NaN"),
-    "a sigma alone": (lambda f: np.save(f / "power_drill_A0.sigma.npy", np.ones((32, 40))), "A60.sigma.npy: is miss"),
+    "another size": (
+        lambda f: np.save(f / "power_drill_A0.npy", np.ones((40, 32), np.float32)),
+        "expected shape",
+    ),
+    "NaN": (
+        lambda f: np.save(f / "power_drill_A0.npy", np.full((32, 40), np.nan, np.float32)),
+        "1280 NaN",
+    ),
+    "a sigma alone": (
+        lambda f: np.save(f / "power_drill_A0.sigma.npy", np.ones((32, 40))),
+        "A60.sigma.npy: is miss",
+    ),
     "negative sigma": (
-        lambda f: [np.save(f / f"{p.stem}.sigma.npy", np.full((32, 40), -1.0)) for p in list(f.glob("*.npy"))],
+        lambda f: [
+            np.save(f / f"{p.stem}.sigma.npy", np.full((32, 40), -1.0))
+            for p in list(f.glob("*.npy"))
+        ],
         "expected finite mm of 0 and more",
     ),
     "extra": (lambda f: (f / "notes.txt").write_text("x"), "notes.txt: is extra"),
@@ -74,7 +90,11 @@ def test_only_a_dataset_knows_names_and_frames(predictions, dataset, capsys):
     assert fpp_eval("check", predictions) == 0
     assert fpp_eval("check", predictions, dataset.path) == 1
     said = capsys.readouterr().out
-    for part in ("power_drill_A0.npy: is missing", "a sample of split validation", "frames_used: expected indices"):
+    for part in (
+        "power_drill_A0.npy: is missing",
+        "a sample of split validation",
+        "frames_used: expected indices",
+    ):
         assert part in said
 
 

@@ -1,4 +1,5 @@
-"""Every accepted form of prediction gives the same numbers, and every broken file is refused by name, with advice."""
+"""Every accepted form of prediction gives the same numbers, and every broken file is refused by
+name, with advice."""
 
 import io
 import os
@@ -72,7 +73,9 @@ def mat73_bytes(fill):
     with h5py.File(buffer, "w", userblock_size=512) as file:
         fill(file)
     content = bytearray(buffer.getvalue())
-    content[:128] = b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + struct.pack("<H", 0x0200) + b"IM"
+    content[:128] = (
+        b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + struct.pack("<H", 0x0200) + b"IM"
+    )
     return bytes(content)
 
 
@@ -134,18 +137,27 @@ FORMS = {
     "mat v5": lambda f, m: write_each(f, ".mat", m, mat_of),
     "mat v5 plain": lambda f, m: write_each(f, ".mat", m, lambda d: mat5_bytes(False, depth=d)),
     "mat v7.3 deflated": lambda f, m: write_each(
-        f, ".mat", m, lambda d: mat73_bytes(lambda h: h.create_dataset("depth", data=d.T, compression="gzip"))
+        f,
+        ".mat",
+        m,
+        lambda d: mat73_bytes(lambda h: h.create_dataset("depth", data=d.T, compression="gzip")),
     ),
     "png": lambda f, m: write_each(f, ".png", m, png_of, png_mm_per_level=LEVEL_MM),
-    "parquet": lambda f, m: write_table(f, "predictions.parquet", parquet_bytes(table(m, NESTED_DOUBLE))),
+    "parquet": lambda f, m: write_table(
+        f, "predictions.parquet", parquet_bytes(table(m, NESTED_DOUBLE))
+    ),
     "parquet flat zstd": lambda f, m: write_table(
-        f, "predictions.parquet", parquet_bytes(table(m, pa.list_(pa.float64())), compression="zstd", row_group_size=1)
+        f,
+        "predictions.parquet",
+        parquet_bytes(table(m, pa.list_(pa.float64())), compression="zstd", row_group_size=1),
     ),
     "arrow file": lambda f, m: write_table(
         f, "predictions.arrow", arrow_bytes(table(m, NESTED_DOUBLE), compression="zstd")
     ),
     "arrow stream": lambda f, m: write_table(
-        f, "predictions.arrow", arrow_bytes(table(m, pa.list_(pa.float64(), 1280)), pa.ipc.new_stream)
+        f,
+        "predictions.arrow",
+        arrow_bytes(table(m, pa.list_(pa.float64(), 1280)), pa.ipc.new_stream),
     ),
 }
 
@@ -162,7 +174,9 @@ def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
         results.append(read_json(path))
     plain_metrics, metrics = (result["metrics"] for result in results)
     for key, value in plain_metrics.items():
-        exact = value if value is None or form != "png" else pytest.approx(value, rel=1e-9, abs=1e-9)
+        exact = (
+            value if value is None or form != "png" else pytest.approx(value, rel=1e-9, abs=1e-9)
+        )
         assert metrics[key] == exact, key
     hashes = {row["prediction_sha256"] for row in results[1]["per_sample"]}
     assert len(hashes) == (1 if "arrow" in form or "parquet" in form else 4)
@@ -208,51 +222,100 @@ def virtual(h):
 
 
 def huge_chunk(h):
-    h.create_dataset("depth", SIZE[::-1], "f8", maxshape=(None, None), chunks=(20000, 20000), compression="gzip")
+    h.create_dataset(
+        "depth", SIZE[::-1], "f8", maxshape=(None, None), chunks=(20000, 20000), compression="gzip"
+    )
 
 
 PNG = png_of(DEPTH)
 
 
 def longer_png(content):
-    """The same image with pixels that unpack to 50 MB: only the IDAT chunk is replaced, its checksum made anew."""
+    """The same image with pixels that unpack to 50 MB: only the IDAT chunk is replaced, its
+    checksum made anew."""
     data = zlib.compress(b"\0" * 50_000_000)
     chunk = b"IDAT" + data
     head = content[:33]
-    return head + struct.pack(">I", len(data)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + content[-12:]
+    return (
+        head
+        + struct.pack(">I", len(data))
+        + chunk
+        + struct.pack(">I", zlib.crc32(chunk))
+        + content[-12:]
+    )
 
 
 NOISE = npz_bytes(a=np.random.default_rng(0).random(SIZE))
 PER_SAMPLE = {
-    "npz of two": (".npz", npz_bytes(a=DEPTH, b=DEPTH), r"holds 2 arrays \(a.npy, b.npy\), expected one"),
+    "npz of two": (
+        ".npz",
+        npz_bytes(a=DEPTH, b=DEPTH),
+        r"holds 2 arrays \(a.npy, b.npy\), expected one",
+    ),
     "npz of none": (".npz", zip_bytes({}), "holds 0 arrays"),
-    "npz bomb": (".npz", zip_bytes({"depth.npy": npy_bytes(ZEROS)}), "would unpack to 8000128 bytes"),
-    "npz of a wrong size": (".npz", zip_of_wrong_size(), "unpacks to more than|is no .npz|is truncated|foreign"),
+    "npz bomb": (
+        ".npz",
+        zip_bytes({"depth.npy": npy_bytes(ZEROS)}),
+        "would unpack to 8000128 bytes",
+    ),
+    "npz of a wrong size": (
+        ".npz",
+        zip_of_wrong_size(),
+        "unpacks to more than|is no .npz|is truncated|foreign",
+    ),
     "npz path": (".npz", zip_bytes({"../depth.npy": npy_bytes(DEPTH)}), "leads out of the archive"),
     "npz of text": (".npz", zip_bytes({"readme.txt": b"x"}), "expected one .npy array"),
-    "npz of bz2": (".npz", zip_bytes({"d.npy": npy_bytes(DEPTH)}, zipfile.ZIP_BZIP2), "unusual way"),
+    "npz of bz2": (
+        ".npz",
+        zip_bytes({"d.npy": npy_bytes(DEPTH)}, zipfile.ZIP_BZIP2),
+        "unusual way",
+    ),
     "npz cut off": (".npz", npz_bytes(a=DEPTH)[:-30], "is no .npz archive, or damaged"),
     "npz damaged": (".npz", NOISE[:300] + b"xxxx" + NOISE[304:], "damaged"),
-    "npz of objects": (".npz", zip_bytes({"d.npy": npy_bytes(np.array([[{}]], object))}), "pickled Python objects"),
-    "npz integers": (".npz", npz_bytes(a=DEPTH.astype(np.uint8)), "got uint8: whole numbers .*wrap around"),
+    "npz of objects": (
+        ".npz",
+        zip_bytes({"d.npy": npy_bytes(np.array([[{}]], object))}),
+        "pickled Python objects",
+    ),
+    "npz integers": (
+        ".npz",
+        npz_bytes(a=DEPTH.astype(np.uint8)),
+        "got uint8: whole numbers .*wrap around",
+    ),
     "npz shape": (".npz", npz_bytes(a=DEPTH.T), r"expected shape \(32, 40\) .*got \(40, 32\)"),
     "mat name": (".mat", mat5_bytes(z=DEPTH), "expected the variable depth, got z"),
     "mat integers": (".mat", mat5_bytes(depth=DEPTH.astype(np.int16)), "got int16"),
     "mat complex": (".mat", mat5_bytes(depth=DEPTH + 1j), "complex"),
-    "mat cell": (".mat", mat5_bytes(depth=np.array([["a", 1]], object)), "expected a real numeric matrix"),
+    "mat cell": (
+        ".mat",
+        mat5_bytes(depth=np.array([["a", 1]], object)),
+        "expected a real numeric matrix",
+    ),
     "mat bomb": (".mat", mat5_bytes(depth=ZEROS), "too large"),
     "mat cut off": (".mat", mat5_bytes(depth=DEPTH)[:-20], "cut off|damaged"),
     "mat noise": (".mat", bytes(range(256)) * 4, "neither"),
     "mat v7.3 link": (".mat", mat73_bytes(linked), "depth is a link"),
-    "mat v7.3 other file": (".mat", mat73_bytes(external), "depth is a link|expected the variable depth"),
+    "mat v7.3 other file": (
+        ".mat",
+        mat73_bytes(external),
+        "depth is a link|expected the variable depth",
+    ),
     "mat v7.3 external": (".mat", mat73_bytes(stored_elsewhere), "stored in other files"),
     "mat v7.3 virtual": (".mat", mat73_bytes(virtual), "stored in other files"),
     "mat v7.3 chunk": (".mat", mat73_bytes(huge_chunk), "too large for a depth map"),
-    "mat v7.3 cut off": (".mat", mat73_bytes(lambda h: h.create_dataset("depth", data=DEPTH.T))[:900], "can't be read"),
+    "mat v7.3 cut off": (
+        ".mat",
+        mat73_bytes(lambda h: h.create_dataset("depth", data=DEPTH.T))[:900],
+        "can't be read",
+    ),
     "png 8 bit": (".png", png_bytes(np.zeros(SIZE, np.uint8)), "has 8 bits per channel"),
     "png colour": (".png", png_bytes(np.zeros((*SIZE, 3), np.uint16)), "colour type 2"),
     "png shape": (".png", png_bytes(np.zeros((40, 32), np.uint16)), r"got \(40, 32\)"),
-    "png full": (".png", png_bytes(np.full(SIZE, 65535, np.uint16)), "where depth above 3276.75 mm is cut off"),
+    "png full": (
+        ".png",
+        png_bytes(np.full(SIZE, 65535, np.uint16)),
+        "where depth above 3276.75 mm is cut off",
+    ),
     "png bomb": (".png", longer_png(PNG), "unpacks to more than 2592 bytes"),
     "png checksum": (".png", PNG[:60] + b"\0\0\0\0" + PNG[64:], "a checksum does not match"),
     "png cut off": (".png", PNG[:-12], "cut off or damaged"),
@@ -302,25 +365,42 @@ def ragged(m):
 
 
 TABLES = {
-    "columns": (renamed("name", "depth"), "holds the columns name, depth; expected sample and depth"),
+    "columns": (
+        renamed("name", "depth"),
+        "holds the columns name, depth; expected sample and depth",
+    ),
     "missing": (without_first, "lacks the sample power_drill_A0"),
     "twice": (twice, "holds the sample power_drill_A0 twice"),
-    "unknown": (lambda m: table({**m, "mug_A0": DEPTH}), "holds mug_A0, which is no sample of this split"),
+    "unknown": (
+        lambda m: table({**m, "mug_A0": DEPTH}),
+        "holds mug_A0, which is no sample of this split",
+    ),
     "integers": (
         lambda m: table({k: v.astype(int) for k, v in m.items()}, pa.list_(pa.list_(pa.int32()))),
         "expected lists of float16, float32 or float64, got list<.*int32",
     ),
     "text": (lambda m: pa.table({"sample": list(m), "depth": ["x"] * len(m)}), "got string"),
-    "one number": (lambda m: pa.table({"sample": list(m), "depth": pa.array([1.0] * len(m))}), "got double"),
-    "sample numbers": (lambda m: pa.table({"sample": [1, 2, 3, 4], "depth": table(m)["depth"]}), "expected text"),
+    "one number": (
+        lambda m: pa.table({"sample": list(m), "depth": pa.array([1.0] * len(m))}),
+        "got double",
+    ),
+    "sample numbers": (
+        lambda m: pa.table({"sample": [1, 2, 3, 4], "depth": table(m)["depth"]}),
+        "expected text",
+    ),
     "null": (with_null, "power_drill_A0: holds missing values"),
     "ragged": (ragged, "power_drill_A60: expected rows of one length"),
     "shape": (lambda m: table({k: v[:, :-1] for k, v in m.items()}), r"got \(32, 39\)"),
-    "NaN": (lambda m: table({**m, SAMPLE: np.full(SIZE, np.nan)}), "power_drill_A60: holds 1280 NaN"),
+    "NaN": (
+        lambda m: table({**m, SAMPLE: np.full(SIZE, np.nan)}),
+        "power_drill_A60: holds 1280 NaN",
+    ),
 }
 
 
-@pytest.mark.parametrize(("form", "case"), [("arrow", "ragged"), *(("parquet", case) for case in TABLES)])
+@pytest.mark.parametrize(
+    ("form", "case"), [("arrow", "ragged"), *(("parquet", case) for case in TABLES)]
+)
 def test_broken_table_is_refused(form, case, dataset, tmp_path):
     make, message = TABLES[case]
     encode = parquet_bytes if form == "parquet" else arrow_bytes
@@ -330,10 +410,17 @@ def test_broken_table_is_refused(form, case, dataset, tmp_path):
 
 
 def test_tables_that_would_unpack_to_more_than_a_split_can_need(dataset, tmp_path):
-    large = pa.table({"sample": ["a"] * 4, "depth": pa.array([np.zeros(400_000).tolist()] * 4, FLAT)})
-    folder = write_table(tmp_path / "p", "predictions.parquet", parquet_bytes(large, compression="zstd"))
+    large = pa.table(
+        {"sample": ["a"] * 4, "depth": pa.array([np.zeros(400_000).tolist()] * 4, FLAT)}
+    )
+    folder = write_table(
+        tmp_path / "p", "predictions.parquet", parquet_bytes(large, compression="zstd")
+    )
     assert (folder / "predictions.parquet").stat().st_size < 10_000
-    assert re.search(r"predictions.parquet would unpack to \d+ bytes and 16000\d\d values", refused(dataset, folder))
+    assert re.search(
+        r"predictions.parquet would unpack to \d+ bytes and 16000\d\d values",
+        refused(dataset, folder),
+    )
     write_table(folder, "predictions.parquet", b"PAR1" + b"\0" * 60 + b"PAR1")
     assert "can't be read as Arrow or Parquet" in refused(dataset, folder)
     (folder / "predictions.parquet").unlink()
@@ -344,13 +431,18 @@ def test_tables_that_would_unpack_to_more_than_a_split_can_need(dataset, tmp_pat
 
 @pytest.mark.parametrize("megabytes", [8, 400])
 def test_compressed_arrow_that_unpacks_to_more_than_a_split_can_need(megabytes, dataset, tmp_path):
-    """The larger one is stopped while it is unpacked, before it has taken as much memory as it asks for."""
+    """The larger one is stopped while it is unpacked, before it has taken as much memory as it asks
+    for."""
     zeros = np.zeros(megabytes * 10**6 // 4, np.float32)
     large = pa.table({"sample": ["a"], "depth": pa.ListArray.from_arrays([0, zeros.size], zeros)})
-    folder = write_table(tmp_path / "p", "predictions.arrow", arrow_bytes(large, compression="zstd"))
+    folder = write_table(
+        tmp_path / "p", "predictions.arrow", arrow_bytes(large, compression="zstd")
+    )
     assert (folder / "predictions.arrow").stat().st_size < 100_000
     error = refused(dataset, folder)
-    expected = "unpacks to more than" if megabytes < 100 else "takes more memory than|out of memory|malloc"
+    expected = (
+        "unpacks to more than" if megabytes < 100 else "takes more memory than|out of memory|malloc"
+    )
     assert re.search(rf"predictions.arrow .*({expected})", error), error
 
 
@@ -358,8 +450,12 @@ def test_page_headers_that_contradict_the_footer(dataset, tmp_path):
     """A page that says it unpacks to 8 kB, in a file whose footer says 5 kB."""
     content = parquet_bytes(table({"a": DEPTH}, FLAT), compression="snappy", use_dictionary=False)
     place = pq.read_metadata(io.BytesIO(content)).row_group(0).column(1).data_page_offset
-    assert content[place : place + 3] == b"\x15\x00\x15"  # field 1 is the page type, field 2 the unpacked size
-    assert content[place + 3] >= 0x80 > content[place + 4]  # a number of two bytes; the largest such is 8191
+    assert (
+        content[place : place + 3] == b"\x15\x00\x15"
+    )  # field 1 is the page type, field 2 the unpacked size
+    assert (
+        content[place + 3] >= 0x80 > content[place + 4]
+    )  # a number of two bytes; the largest such is 8191
     for wrong in (
         content[: place + 3] + b"\xfe\x7f" + content[place + 5 :],
         content[:place] + b"\x1b" * (len(content) - place),
@@ -372,7 +468,8 @@ def test_page_headers_that_contradict_the_footer(dataset, tmp_path):
 @pytest.mark.parametrize("answer", ["os.abort()", "time.sleep(60)", "bytearray(10**9)"])
 def test_a_process_that_reads_is_bounded_and_its_end_is_a_refusal(answer, tmp_path, monkeypatch):
     (tmp_path / "reader_of_test.py").write_text(
-        "import os, time\nfrom fpp_ml_bench.containers import limit_memory\ndef read(content, largest):\n"
+        "import os, time\nfrom fpp_ml_bench.containers import limit_memory\ndef read(content, "
+        "largest):\n"
         f"    limit_memory(largest)\n    return {{}}, content or bytes({answer})\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -385,7 +482,9 @@ def test_a_process_that_reads_is_bounded_and_its_end_is_a_refusal(answer, tmp_pa
     with monkeypatch.context() as impatient:
         if "sleep" in answer:
             impatient.setattr(containers, "TIMEOUT_S", 0.1)
-        with pytest.raises(PredictionError, match=r"it ended the process|within 0.1 s|more memory than 1000 bytes"):
+        with pytest.raises(
+            PredictionError, match=r"it ended the process|within 0.1 s|more memory than 1000 bytes"
+        ):
             read(b"")
     assert (process.returncode is None) == ("bytearray" in answer)
     assert read(b"good") == ({}, b"good")  # by the same process, or by a new one
@@ -402,7 +501,10 @@ def test_forms_cannot_be_mixed_and_links_are_refused(dataset, tmp_path):
     (folder / "predictions.parquet").write_bytes(b"")
     error = refused(dataset, folder)
     assert f"{SAMPLE}.npy: is extra (the other predictions are .npz files: keep one form)" in error
-    assert "predictions.parquet: is extra (the other predictions are .npz files: keep one form)" in error
+    assert (
+        "predictions.parquet: is extra (the other predictions are .npz files: keep one form)"
+        in error
+    )
     table_folder = tmp_path / "t"
     write_table(table_folder, "predictions.parquet", parquet_bytes(table(depths)))
     (table_folder / "predictions.parquet").rename(tmp_path / "elsewhere")
@@ -414,14 +516,44 @@ UNITS = {
     "metres as mm": ("mm", lambda d: d / 1000, {}, "looks like metres .*declare units: m"),
     "normalised as mm": ("mm", lambda d: d / d.max(), {}, "looks like metres or normalised depth"),
     "mm as metres": ("m", lambda d: d, {}, "does not look like metres: .*declare units: mm"),
-    "normalised as metres": ("m", lambda d: d / 3000, {}, "does not look like metres: .*declare units: normalised"),
-    "metres as normalised": ("normalised", lambda d: d / 1000, ORACLE, "normalised depth: .*m or mm"),
+    "normalised as metres": (
+        "m",
+        lambda d: d / 3000,
+        {},
+        "does not look like metres: .*declare units: normalised",
+    ),
+    "metres as normalised": (
+        "normalised",
+        lambda d: d / 1000,
+        ORACLE,
+        "normalised depth: .*m or mm",
+    ),
     "mm as normalised": ("normalised", lambda d: d, ORACLE, "does not look like normalised"),
-    "normalised, metric track": ("normalised", lambda d: d / 3000, {}, "needs uses_ground_truth_range: true"),
-    "scale without PNG": ("mm", lambda d: d, {"png_mm_per_level": 0.1}, "png_mm_per_level is given, but"),
+    "normalised, metric track": (
+        "normalised",
+        lambda d: d / 3000,
+        {},
+        "needs uses_ground_truth_range: true",
+    ),
+    "scale without PNG": (
+        "mm",
+        lambda d: d,
+        {"png_mm_per_level": 0.1},
+        "png_mm_per_level is given, but",
+    ),
     "scale in metres": ("m", lambda d: d / 1000, {"png_mm_per_level": 0.1}, "units must be mm"),
-    "negative scale": ("mm", lambda d: d, {"png_mm_per_level": -0.1}, "png_mm_per_level: .*greater than 0"),
-    "huge in metres": ("m", lambda d: np.where(d == d.max(), 1e29, d / 1000), {}, "the limit is 1e\\+27"),
+    "negative scale": (
+        "mm",
+        lambda d: d,
+        {"png_mm_per_level": -0.1},
+        "png_mm_per_level: .*greater than 0",
+    ),
+    "huge in metres": (
+        "m",
+        lambda d: np.where(d == d.max(), 1e29, d / 1000),
+        {},
+        "the limit is 1e\\+27",
+    ),
 }
 
 

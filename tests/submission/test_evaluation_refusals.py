@@ -1,4 +1,5 @@
-"""Predictions and descriptions that must not be scored: through the real command, exit status 2, no JSON, named."""
+"""Predictions and descriptions that must not be scored: through the real command, exit status 2, no
+JSON, named."""
 
 import os
 import re
@@ -51,7 +52,10 @@ def with_value(value: float, count: int = 1) -> Callable[[Path], None]:
 
 
 def header(text: bytes, magic: bytes = b"\x93NUMPY\x01\x00") -> Callable[[Path], None]:
-    return lambda folder: (folder / FILE).write_bytes(magic + struct.pack("<H", len(text)) + text + b"\0" * 64) and None
+    return lambda folder: (
+        (folder / FILE).write_bytes(magic + struct.pack("<H", len(text)) + text + b"\0" * 64)
+        and None
+    )
 
 
 def cut(folder: Path) -> None:
@@ -84,30 +88,56 @@ def replace_by_pipe(folder: Path) -> None:
 ADVICE = r"\b(write|save|use|predict|give|convert|put|copy|remove|replace|check)\b"
 FILES = {
     "missing": (lambda f: (f / FILE).unlink(), "is missing"),
-    "wrong shape": (rewrite(lambda d: d[:-1]), r"expected shape \(32, 40\) \(H, W\), got \(31, 40\)"),
+    "wrong shape": (
+        rewrite(lambda d: d[:-1]),
+        r"expected shape \(32, 40\) \(H, W\), got \(31, 40\)",
+    ),
     "transposed": (rewrite(lambda d: d.T), r"got \(40, 32\); it looks transposed"),
-    "extra axis": (rewrite(lambda d: d[None]), r"got \(1, 32, 40\); it has an axis too many; write np.squeeze"),
-    "channels": (rewrite(lambda d: np.stack([d] * 3)), r"got \(3, 32, 40\); write the map of depth alone"),
-    "a mark": (rewrite(lambda d: np.where(d > 0, d, 65504)), r"holds a mark .*% of the pixels are exactly 65504"),
-    "a negative mark": (rewrite(lambda d: np.where(d > 0, d, -1)), r"are exactly -1, far .* or give .* nodata"),
+    "extra axis": (
+        rewrite(lambda d: d[None]),
+        r"got \(1, 32, 40\); it has an axis too many; write np.squeeze",
+    ),
+    "channels": (
+        rewrite(lambda d: np.stack([d] * 3)),
+        r"got \(3, 32, 40\); write the map of depth alone",
+    ),
+    "a mark": (
+        rewrite(lambda d: np.where(d > 0, d, 65504)),
+        r"holds a mark .*% of the pixels are exactly 65504",
+    ),
+    "a negative mark": (
+        rewrite(lambda d: np.where(d > 0, d, -1)),
+        r"are exactly -1, far .* or give .* nodata",
+    ),
     "scalar": (rewrite(lambda d: np.float32(1)), r"got \(\)"),
     "uint16": (rewrite(lambda d: d.astype(np.uint16)), "got uint16"),
     "complex": (rewrite(lambda d: d.astype(np.complex64)), "got complex64"),
-    "structured": (rewrite(lambda d: d.view([("z", "<f4")])), "expected float16, float32 or float64"),
+    "structured": (
+        rewrite(lambda d: d.view([("z", "<f4")])),
+        "expected float16, float32 or float64",
+    ),
     "objects": (pickled, "pickled Python objects"),
     "one NaN": (with_value(np.nan), "holds 1 NaN of 1280 values"),
     "infinities": (with_value(np.inf, 3), "holds 3 infinite of 1280 values"),
     "absurd": (with_value(3e38), "the limit is 1e\\+30"),
-    "normalised": (rewrite(lambda d: d / d.max()), "looks like metres or normalised depth: its largest value is 1"),
+    "normalised": (
+        rewrite(lambda d: d / d.max()),
+        "looks like metres or normalised depth: its largest value is 1",
+    ),
     "truncated": (cut, "is truncated: expected 5248 bytes, got 5244"),
     "grown": (grow, "foreign bytes"),
     "noise": (lambda f: (f / FILE).write_bytes(bytes(range(256)) * 8), "is no .npy file"),
     "zip archive": (archive, "np.savez"),
     "no dictionary": (header(b"import os\n"), "is no .npy file"),
     "nested header": (header(b"(" * 9000), "is no .npy file"),
-    "huge shape": (header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999), }\n"), "expected shape"),
+    "huge shape": (
+        header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999), }\n"),
+        "expected shape",
+    ),
     "unprintable shape": (
-        header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (0x" + b"f" * 5000 + b", 4), }\n"),
+        header(
+            b"{'descr': '<f4', 'fortran_order': False, 'shape': (0x" + b"f" * 5000 + b", 4), }\n"
+        ),
         r"got \(more than 10\^18, 4\)",
     ),
     "format 3.0": (header(b"{}", b"\x93NUMPY\x03\x00"), "format version"),
@@ -121,7 +151,9 @@ def test_bad_prediction_file_is_refused_by_name(case, tmp_path, dataset, predict
     change_folder, message = FILES[case]
     change_folder(predictions)
     if case == "symbolic link":
-        (tmp_path / "elsewhere.npy").rename(predictions.parent.parent / f"{tmp_path.name}-elsewhere.npy")
+        (tmp_path / "elsewhere.npy").rename(
+            predictions.parent.parent / f"{tmp_path.name}-elsewhere.npy"
+        )
     error = refused(tmp_path, dataset, predictions)
     line = re.search(rf"^\s*{re.escape(FILE)}: .*{message}.*$", error, flags=re.MULTILINE)
     assert line, error
@@ -154,7 +186,9 @@ def test_every_offender_is_named_at_once(tmp_path, dataset, predictions):
 
 
 def test_several_faults_of_one_file_are_all_named(tmp_path, dataset, predictions):
-    rewrite(lambda d: np.where(np.arange(1280).reshape(32, 40) == 0, np.nan, d / 1000 - 1e-3))(predictions)
+    rewrite(lambda d: np.where(np.arange(1280).reshape(32, 40) == 0, np.nan, d / 1000 - 1e-3))(
+        predictions
+    )
     error = refused(tmp_path, dataset, predictions)
     assert f"{FILE}: holds 1 NaN" in error and "looks like metres" in error
 
@@ -187,15 +221,27 @@ DESCRIPTIONS = {
     "negative frame": ({"frames_used": [-1]}, r"frames_used\.0: .*greater"),
     "frame twice": ({"frames_used": [1, 1]}, "frames_used names a frame twice"),
     "empty frames": ({"frames_used": []}, "frames_used: .*at least 1 item"),
-    "frame outside": ({"frames_used": [3, 52]}, r"frames_used: expected indices from 0 to 51 .*got \[52\]"),
+    "frame outside": (
+        {"frames_used": [3, 52]},
+        r"frames_used: expected indices from 0 to 51 .*got \[52\]",
+    ),
     "no time": ({"seconds_per_sample": 0.0}, "seconds_per_sample: .*greater"),
     "NaN time": ({"seconds_per_sample": float("nan")}, "seconds_per_sample: .*finite"),
     "time without its machine": ({"hardware": ...}, "needs seconds_source and hardware"),
     "unknown source": ({"seconds_source": "guessed"}, "seconds_source: .*measured"),
     "unknown hardware key": ({"hardware": {"cpu": "x", "ghz": 3}}, r"hardware\.ghz: is not a key"),
-    "unknown data": ({"learned_from": {"data": "everything"}}, r"learned_from\.data: .*'train-split'"),
-    "train split of what": ({"learned_from": {"data": "train-split"}}, "data: train-split needs versions"),
-    "versions of nothing": ({"learned_from": {"data": "none", "versions": ["x"]}}, "from no data has no versions"),
+    "unknown data": (
+        {"learned_from": {"data": "everything"}},
+        r"learned_from\.data: .*'train-split'",
+    ),
+    "train split of what": (
+        {"learned_from": {"data": "train-split"}},
+        "data: train-split needs versions",
+    ),
+    "versions of nothing": (
+        {"learned_from": {"data": "none", "versions": ["x"]}},
+        "from no data has no versions",
+    ),
     "nested settings": ({"settings": {"a": {"b": 1}}}, r"settings\.a"),
 }
 
@@ -238,7 +284,8 @@ def test_description_that_is_no_description(case, tmp_path, dataset, predictions
 
 
 def test_description_is_written_as_it_is_read(predictions):
-    """Only the keys that were given, and false never for a mask that was not; so `predict` writes what it knows."""
+    """Only the keys that were given, and false never for a mask that was not; so `predict` writes
+    what it knows."""
     read = read_submission(predictions)
     (predictions / "submission.yaml").write_text(read.to_yaml(), encoding="utf-8")
     assert read_submission(predictions) == read

@@ -1,4 +1,5 @@
-"""The optional uncertainty of a submission: accepted whole, refused with a sentence otherwise, and no score moves."""
+"""The optional uncertainty of a submission: accepted whole, refused with a sentence otherwise, and
+no score moves."""
 
 import re
 
@@ -39,8 +40,14 @@ def test_one_of_another_sample_is_extra(dataset, predictions):
     ("change", "said"),
     [
         (lambda file: file.unlink(), "is missing; write one for each sample, or none"),
-        (lambda file: np.save(file, np.full((32, 40), np.nan, np.float32)), "expected finite mm of 0 and more"),
-        (lambda file: np.save(file, np.full((32, 40), -1, np.float32)), "expected finite mm of 0 and more"),
+        (
+            lambda file: np.save(file, np.full((32, 40), np.nan, np.float32)),
+            "expected finite mm of 0 and more",
+        ),
+        (
+            lambda file: np.save(file, np.full((32, 40), -1, np.float32)),
+            "expected finite mm of 0 and more",
+        ),
         (lambda file: file.write_bytes(file.read_bytes()[:-4]), "is truncated"),
     ],
 )

@@ -1,5 +1,5 @@
-"""Error against run time, frames and memory: points against the evaluator, fronts against brute force, powers against
-SciPy, resuming, refusals, the page."""
+"""Error against run time, frames and memory: points against the evaluator, fronts against brute
+force, powers against SciPy, resuming, refusals, the page."""
 
 import json
 import subprocess
@@ -62,7 +62,8 @@ def small(tmp_path_factory):
 
 
 class Answer(Method):
-    """A method that knows the answers, off by ``offset_mm``; ``rows`` rows of each image it leaves out."""
+    """A method that knows the answers, off by ``offset_mm``; ``rows`` rows of each image it leaves
+    out."""
 
     name, title, settings = "answer", "Answer", {}
 
@@ -76,7 +77,8 @@ class Answer(Method):
         )
 
     def predict(self, frames):
-        # The dataset's frames hold one grey level each: the sample's number among those of its split.
+        # The dataset's frames hold one grey level each: the sample's number among those of its
+        # split.
         depth = self.dataset.depth_mm(self.dataset.samples("test")[int(frames[0][0, 0])]).copy()
         depth[depth > 0] += np.float32(self.offset_mm)
         depth[: self.rows] = 0
@@ -85,14 +87,19 @@ class Answer(Method):
 
 @pytest.fixture
 def answers(small, monkeypatch):
-    """A registry of `Answer` under any name. Returns, by name, the variants (to be changed), and the calls."""
-    known = SimpleNamespace(variants={"good": [{}], "bad": [{"offset_mm": 9.0}]}, made=[], trivial=False)
+    """A registry of `Answer` under any name. Returns, by name, the variants (to be changed), and
+    the calls."""
+    known = SimpleNamespace(
+        variants={"good": [{}], "bad": [{"offset_mm": 9.0}]}, made=[], trivial=False
+    )
 
     def find(name):
         options = make_dataclass("Options", ("offset_mm", "threads"))
         if name not in known.variants:
             raise PredictionError(f"unknown method {name}")
-        kind = SimpleNamespace(Options=options, trivial=known.trivial, variants=lambda rig: known.variants[name])
+        kind = SimpleNamespace(
+            Options=options, trivial=known.trivial, variants=lambda rig: known.variants[name]
+        )
         kind.__module__, kind.__qualname__ = Method.__module__, name
         return SimpleNamespace(method=kind)
 
@@ -125,17 +132,29 @@ def test_a_point_is_what_the_evaluator_says(small, tmp_path, answers):
     expected = evaluate(folder, small, target="depth_exact")
     answers.variants["good"] = [{"offset_mm": 3.0, "rows": 16}]
     (point,) = measure.tradeoff(plan_of(small, tmp_path / "out", "good", views=2)).points
-    assert point.frames == 1 and point.seconds > 0 and point.batch_seconds > 0 and point.title == "Answer"
+    assert (
+        point.frames == 1
+        and point.seconds > 0
+        and point.batch_seconds > 0
+        and point.title == "Answer"
+    )
     assert point.object_mae_mm == pytest.approx(expected.metrics.object_mae_mm)
-    assert 0 < point.missing_share < 1 and point.working_memory_mib in (None, pytest.approx(0, abs=5))
+    assert 0 < point.missing_share < 1 and point.working_memory_mib in (
+        None,
+        pytest.approx(0, abs=5),
+    )
     assert point.label == "good offset_mm=3.0 rows=16" and point.software["numpy"] == np.__version__
 
 
-def test_a_long_reason_and_a_failure_in_ones_own_file_are_reasons(small, tmp_path, answers, monkeypatch):
+def test_a_long_reason_and_a_failure_in_ones_own_file_are_reasons(
+    small, tmp_path, answers, monkeypatch
+):
     """Both are in the file of the run, which can be read again."""
     (tmp_path / "mine.py").write_text("def fail():\n    return 1 / 0\n")
     failing = load_from_file(f"{tmp_path / 'mine.py'}:fail")
-    for number, (fail, says) in enumerate([(None, "because"), (failing, "line 2, in fail: ZeroDivisionError")]):
+    for number, (fail, says) in enumerate(
+        [(None, "because"), (failing, "line 2, in fail: ZeroDivisionError")]
+    ):
 
         def load_method(name, source, fail=fail, **options):
             if fail is not None:
@@ -153,11 +172,20 @@ def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answ
     answers.variants["good"] = [{"frame": 7}]
     run = measure.tradeoff(plan_of(small, tmp_path / "out", "good", "bad"))
     failed, one_size = run.points
-    assert "frame 7 is not stored" in failed.failed and failed.seconds is None and failed.object_mae_mm is None
+    assert (
+        "frame 7 is not stored" in failed.failed
+        and failed.seconds is None
+        and failed.object_mae_mm is None
+    )
     assert one_size.object_mae_mm == 8.5 and one_size.pixel_seconds is None
     assert remarks(run)[0].startswith("Not measured: good frame=7: ")
-    assert remarks(run)[1] == "Not measured at other sizes: bad offset_mm=9.0: works at one size only"
-    assert point_table(run).texts[0][1:] == ("", "-", "-", "-", "-", "-") and len(growth_table(run).texts) == 1
+    assert (
+        remarks(run)[1] == "Not measured at other sizes: bad offset_mm=9.0: works at one size only"
+    )
+    assert (
+        point_table(run).texts[0][1:] == ("", "-", "-", "-", "-", "-")
+        and len(growth_table(run).texts) == 1
+    )
     for wrong in (np.float32([[1]]), np.full(small.size, np.nan, np.float32)):
         monkeypatch.setattr(Answer, "predict", lambda self, frames, wrong=wrong: wrong)
         (point,) = measure.tradeoff(plan_of(small, tmp_path / "wrong", "bad")).points
@@ -167,11 +195,17 @@ def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answ
 def test_told_and_trivial_methods_are_on_no_front(small, tmp_path, answers, monkeypatch):
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", True)
     run = measure.tradeoff(plan_of(small, tmp_path / "told", "bad"))
-    assert run.points[0].off_front_reason == "given the view's object mask" == point_table(run).texts[0][1]
+    assert (
+        run.points[0].off_front_reason
+        == "given the view's object mask"
+        == point_table(run).texts[0][1]
+    )
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", False)
     answers.trivial = True
     run = measure.tradeoff(plan_of(small, tmp_path / "trivial", "bad"))
-    assert run.points[0].off_front_reason == "trivial" and all(run.front(cost) == [] for cost in COST_KEYS)
+    assert run.points[0].off_front_reason == "trivial" and all(
+        run.front(cost) == [] for cost in COST_KEYS
+    )
 
 
 def test_views_are_spread_and_differ_between_objects(small):
@@ -189,7 +223,9 @@ def test_threads_go_to_the_methods_that_take_them(small, tmp_path, answers):
 def test_all_methods_and_networks_of_the_size_are_measured(small, tmp_path, answers):
     answers.variants |= {name: [{}] for name in shipped_names()} | {"other rigs": []}
     assert [point.method for point in planned(small.path, tmp_path).points][:2] == ["good", "bad"]
-    assert [point.method for point in planned(small.path, tmp_path, ["other rigs"]).points] == ["other rigs"]
+    assert [point.method for point in planned(small.path, tmp_path, ["other rigs"]).points] == [
+        "other rigs"
+    ]
     networks = measure._networks((224, 224))
     assert "unet-individual-rmse" in networks and not measure._networks(small.size)
 
@@ -217,7 +253,13 @@ def tradeoff_of(dataset, points):
         target="depth_exact",
         views=["power_drill_A0"],
         settings={"package": "1", "threads": 1, "clock": "wall"},
-        hardware={"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"},
+        hardware={
+            "cpu": "Some CPU",
+            "cores": 2,
+            "memory_gib": 8.0,
+            "gpu": None,
+            "platform": "Linux",
+        },
         pixels=[100, 200, 400],
         points=list(points),
     )
@@ -237,25 +279,34 @@ def test_the_front_is_what_no_point_beats(triples, cost):
         for better in points
         if getattr(better, cost) <= getattr(beaten_point, cost)
         and better.object_mae_mm <= beaten_point.object_mae_mm
-        and (getattr(better, cost), better.object_mae_mm) != (getattr(beaten_point, cost), beaten_point.object_mae_mm)
+        and (getattr(better, cost), better.object_mae_mm)
+        != (getattr(beaten_point, cost), beaten_point.object_mae_mm)
     }
     assert {p.key for p in run.front(cost)} == {p.key for p in points} - beaten
 
 
 def test_no_power_comes_from_one_amount_or_from_none():
-    assert power([(5, 1.0), (5, 2.0)]) is None and power([]) is None and power([(0, 1.0), (5, 2.0)]) is None
+    assert (
+        power([(5, 1.0), (5, 2.0)]) is None
+        and power([]) is None
+        and power([(0, 1.0), (5, 2.0)]) is None
+    )
 
 
 def test_a_power_is_that_of_least_squares():
     amounts = [10, 20, 40, 80, 160]
-    seconds = 2e-3 * np.array(amounts) ** 1.4 * np.exp(0.1 * np.random.default_rng(1).standard_normal(5))
+    seconds = (
+        2e-3 * np.array(amounts) ** 1.4 * np.exp(0.1 * np.random.default_rng(1).standard_normal(5))
+    )
     assert power(zip(amounts, seconds, strict=True)) == pytest.approx(
         stats.linregress(np.log(amounts), np.log(seconds)).slope
     )
 
 
 def test_growth_over_pixels_and_frames(small):
-    first = point("a", 1.0, 10, 2.0, pixel_seconds=[0.001, 0.002, 0.004]).model_copy(update={"options": {"steps": 4}})
+    first = point("a", 1.0, 10, 2.0, pixel_seconds=[0.001, 0.002, 0.004]).model_copy(
+        update={"options": {"steps": 4}}
+    )
     second = point("a", 4.0, 20, 1.0).model_copy(update={"options": {"steps": 9}})
     other = point("a", 4.0, 5, 1.0).model_copy(update={"options": {"steps": 9, "fewest": True}})
     run = tradeoff_of(small, [first, second, other, point("b", 1.0, 1, 9.0)])
@@ -276,7 +327,9 @@ def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path, ans
     second = measure.tradeoff(plan_of(small, tmp_path, "a", "lost"))
     assert len(answers.made) == 4 and answers.made[-1][0] == "lost" and second == first
     answers.variants["more"] = [{}]
-    third = measure.tradeoff(plan_of(small, tmp_path, "more"))  # what the folder holds of others stays
+    third = measure.tradeoff(
+        plan_of(small, tmp_path, "more")
+    )  # what the folder holds of others stays
     assert [p.label for p in third.points] == ["a", "a offset_mm=2.0", "lost frame=7", "more"]
 
 
@@ -284,7 +337,9 @@ def test_a_changed_file_is_measured_again(small, tmp_path, answers, monkeypatch)
     monkeypatch.chdir(tmp_path)
     answers.variants = {"mine.py:Mine": [{}]}
     # In a process of its own, which reads the file once.
-    monkeypatch.setattr(measure, "source_sha256", lambda method: str(code_in.__wrapped__(tmp_path / "mine.py")))
+    monkeypatch.setattr(
+        measure, "source_sha256", lambda method: str(code_in.__wrapped__(tmp_path / "mine.py"))
+    )
     for content, times in (("1", 1), ("1", 1), ("2", 2)):
         (tmp_path / "mine.py").write_text(content)
         measure.tradeoff(plan_of(small, tmp_path / "out", "mine.py:Mine"))
@@ -302,12 +357,19 @@ def test_runs_of_other_data_settings_or_machines_do_not_mix(small, tmp_path, ans
         monkeypatch.context() as patched,
         pytest.raises(SubmissionError, match=r"another hardware .*cpu='Another' .* now"),
     ):
-        patched.setattr(measure, "describe_hardware", lambda: SimpleNamespace(to_dict=lambda: machine))
+        patched.setattr(
+            measure, "describe_hardware", lambda: SimpleNamespace(to_dict=lambda: machine)
+        )
         measure.tradeoff(plan_of(small, tmp_path, "bad"))
-    other = make_dataset(tmp_path / "other", scene=lambda n: (np.full((32, 40), n, np.uint8), small_depth(n)))
+    other = make_dataset(
+        tmp_path / "other", scene=lambda n: (np.full((32, 40), n, np.uint8), small_depth(n))
+    )
     with pytest.raises(SubmissionError, match="another fingerprint"):
         measure.tradeoff(plan_of(other, tmp_path, "bad"))
-    with exclusive(tmp_path / ".lock", tmp_path, "measuring"), pytest.raises(BuildError, match="another process"):
+    with (
+        exclusive(tmp_path / ".lock", tmp_path, "measuring"),
+        pytest.raises(BuildError, match="another process"),
+    ):
         measure.tradeoff(plan_of(small, tmp_path, "bad"))
     for content in ("nonsense\n", '{"tradeoff_schema_version": "1.0.0"}'):
         (tmp_path / TRADEOFF_FILE).write_text(content)
@@ -321,20 +383,31 @@ def small_depth(number):
     return depth
 
 
-def test_the_clock_is_the_wall_or_the_processor_and_long_runs_are_not_repeated(small, tmp_path, monkeypatch):
+def test_the_clock_is_the_wall_or_the_processor_and_long_runs_are_not_repeated(
+    small, tmp_path, monkeypatch
+):
     monkeypatch.setattr(measure, "perf_counter", iter([1.0, 3.0]).__next__)
     ticks = [0.0, 0.5, 1.0, 1.3, 2.0, 2.4]  # three runs, until a second is used up
     monkeypatch.setattr(measure, "process_time", iter(ticks).__next__)
     assert planned(small.path, tmp_path, ["constant"]).timed(len, "four") == (2.0, 4)
-    assert planned(small.path, tmp_path, ["constant"], clock="processor").timed(len, "four") == (pytest.approx(0.4), 4)
+    assert planned(small.path, tmp_path, ["constant"], clock="processor").timed(len, "four") == (
+        pytest.approx(0.4),
+        4,
+    )
 
 
 def test_files_hold_what_was_measured(small, tmp_path):
     run = tradeoff_of(small, [point("exact", 0.02, 10, 0.5), point("few|frames", 0.2, 1, 9.0)])
     measure.write_json(run.model_dump(mode="json"), tmp_path / TRADEOFF_FILE)
-    assert [path.name for path in write_report(run, tmp_path)] == ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
+    assert [path.name for path in write_report(run, tmp_path)] == [
+        "tradeoff.json",
+        "tradeoff.md",
+        "tradeoff.png",
+    ]
     lines = (tmp_path / "tradeoff.md").read_text().splitlines()
-    assert lines[0].startswith("small, 40 x 32 px, 1 test views, against depth_exact; wall-clock time, 1 thread(s)")
+    assert lines[0].startswith(
+        "small, 40 x 32 px, 1 test views, against depth_exact; wall-clock time, 1 thread(s)"
+    )
     assert lines[4] == "| exact | time, frames, memory | 0.500 | 0.0% | 20 | 10 | 2 |"
     assert lines[5] == "| few&#124;frames | frames | 9.000 | 0.0% | 200 | 1 | 2 |"
     assert read_tradeoff(tmp_path / TRADEOFF_FILE) == run
@@ -343,7 +416,9 @@ def test_files_hold_what_was_measured(small, tmp_path):
     (tmp_path / "broken.json").write_text(json.dumps(broken))
     with pytest.raises(SubmissionError, match=r"points\.0\.frames"):
         read_tradeoff(tmp_path / "broken.json")
-    (tmp_path / "broken.json").write_text(json.dumps(run.model_dump(mode="json") | {"image_size": [32]}))
+    (tmp_path / "broken.json").write_text(
+        json.dumps(run.model_dump(mode="json") | {"image_size": [32]})
+    )
     with pytest.raises(SubmissionError, match="image_size"):
         read_tradeoff(tmp_path / "broken.json")
 
@@ -351,19 +426,41 @@ def test_files_hold_what_was_measured(small, tmp_path):
 def test_the_command_measures(tiny, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(OWN_METHOD)
-    command = ["tradeoff", str(tiny), "--quick", "--method", "classical", "--method", "mine.py:Flat"]
+    command = [
+        "tradeoff",
+        str(tiny),
+        "--quick",
+        "--method",
+        "classical",
+        "--method",
+        "mine.py:Flat",
+    ]
     assert main([*command, "--list"]) == 0 and not (tmp_path / "tradeoff").exists()
     listed = capsys.readouterr().out
     assert "classical steps=3 fewest\n" in listed and listed.endswith("8 points on 1 views.\n")
     assert main(command) == 0
     printed = capsys.readouterr().out
-    assert "Front of" in printed and "How time grows" in printed and "Written: tradeoff/tradeoff.png" in printed
+    assert (
+        "Front of" in printed
+        and "How time grows" in printed
+        and "Written: tradeoff/tradeoff.png" in printed
+    )
     run = read_tradeoff(tmp_path / "tradeoff" / TRADEOFF_FILE)
     assert len(run.points) == 8 and not any(p.failed for p in run.points) and len(run.pixels) == 3
     by_label = {p.label: p for p in run.points}
-    many, few, own = by_label["classical steps=18"], by_label["classical steps=3"], by_label["mine.py:Flat"]
-    assert (many.frames, few.frames, own.frames) == (50, 20, 1) and many.object_mae_mm < few.object_mae_mm < 2
-    assert many in run.front("frames") and own in run.front("frames") and len(own.pixel_seconds) == 3
+    many, few, own = (
+        by_label["classical steps=18"],
+        by_label["classical steps=3"],
+        by_label["mine.py:Flat"],
+    )
+    assert (many.frames, few.frames, own.frames) == (
+        50,
+        20,
+        1,
+    ) and many.object_mae_mm < few.object_mae_mm < 2
+    assert (
+        many in run.front("frames") and own in run.front("frames") and len(own.pixel_seconds) == 3
+    )
 
 
 def test_sizes_are_smaller_where_the_fringes_allow_it(tiny, tmp_path):
@@ -380,7 +477,10 @@ def test_refusals(small, tiny, tmp_path, capsys):
     assert main(["tradeoff", str(tiny), "--method", "nothing-known", "--list"]) == 2
     assert "nothing-known" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
-    assert main(["tradeoff", str(small.path), "--out", str(tmp_path / "file"), "--method", "constant"]) == 2
+    assert (
+        main(["tradeoff", str(small.path), "--out", str(tmp_path / "file"), "--method", "constant"])
+        == 2
+    )
     assert main(["leaderboard", "--tradeoff", str(tmp_path / "file")]) == 2
     assert "--page" in capsys.readouterr().err
     for words in (["--threads", "0"], ["--views", "0"], ["--clock", "sun"]):

@@ -1,4 +1,5 @@
-"""The training engine: same bits again, same bits after a kill, and a stop where there must be one."""
+"""The training engine: same bits again, same bits after a kill, and a stop where there must be
+one."""
 
 import json
 import math
@@ -41,7 +42,14 @@ from fpp_ml_bench.loaders.training import FringeDepthDataset
 def small(name="normalization/individual", **changes):
     """A shipped recipe cut down to seconds."""
     content = load_recipe(name, "small").to_dict()
-    content |= {"size": TINY_SIZE, "width": 2, "max_epochs": 3, "pairs_per_epoch": 4, "validation_pairs": 2, "batch": 2}
+    content |= {
+        "size": TINY_SIZE,
+        "width": 2,
+        "max_epochs": 3,
+        "pairs_per_epoch": 4,
+        "validation_pairs": 2,
+        "batch": 2,
+    }
     return recipe_from_dict({**content, **changes})
 
 
@@ -90,7 +98,8 @@ def test_the_same_bits_again(uninterrupted, tmp_path, trained):
 
 
 def test_faded_gradients_are_zero_within_a_training_only():
-    """Floats below 1e-38 cost a processor many times as much as others; gradients fade into them."""
+    """Floats below 1e-38 cost a processor many times as much as others; gradients fade into
+    them."""
     faded = torch.full((64,), 1e-39)
     with reproducible(cpu=True):
         assert not (faded * 0.5).any()
@@ -99,7 +108,9 @@ def test_faded_gradients_are_zero_within_a_training_only():
 
 @pytest.mark.processes
 @pytest.mark.parametrize("batch_of_the_kill", [0, 3])
-def test_killed_and_resumed_is_uninterrupted(uninterrupted, tmp_path, monkeypatch, batch_of_the_kill, trained):
+def test_killed_and_resumed_is_uninterrupted(
+    uninterrupted, tmp_path, monkeypatch, batch_of_the_kill, trained
+):
     batches = []
 
     def kill(self):
@@ -134,7 +145,8 @@ def test_further_directions_train(name, tmp_path, trained):
 
 
 def validation_of(weights, dataset, recipe):
-    """What a log must say of ``weights``, by `score_sample` and NumPy: the mean loss and the scores in mm."""
+    """What a log must say of ``weights``, by `score_sample` and NumPy: the mean loss and the scores
+    in mm."""
     data = FringeDepthDataset(dataset, "validation", recipe.frames, recipe.normalisation)
     model, rows, losses = load(weights), [], []
     for index in spread(len(data), recipe.validation_pairs):
@@ -143,19 +155,30 @@ def validation_of(weights, dataset, recipe):
         target = data.source.depth_mm(data.samples[int(item.row)]).astype(np.float64)
         low, high = (float(v) for v in item.depth_range_mm)
         if recipe.normalisation == "individual":
-            prediction = denormalise(values, "individual", low, high) - np.where(target > 0, 0.0, low)
+            prediction = denormalise(values, "individual", low, high) - np.where(
+                target > 0, 0.0, low
+            )
         else:
             prediction = denormalise(values, recipe.normalisation, low, high)
-        void = None if recipe.normalisation == "individual" else data.source.void(data.samples[int(item.row)])
+        void = (
+            None
+            if recipe.normalisation == "individual"
+            else data.source.void(data.samples[int(item.row)])
+        )
         rows.append(score_sample(prediction, target, void=void).metrics())
-        losses.append(math.sqrt(float(((values - item.depth[0].numpy()).astype(np.float64) ** 2).mean()) + 1e-8))
+        losses.append(
+            math.sqrt(
+                float(((values - item.depth[0].numpy()).astype(np.float64) ** 2).mean()) + 1e-8
+            )
+        )
     return np.mean(losses), over_samples(rows)
 
 
 SCORES = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
 FLOAT32 = 1e-5
-"""The same float32 network with another batch size or number of threads: its sums of up to 300 terms, rounded to 6e-8
-each and added up in another order, differ by about 6e-8 sqrt(300) = 1e-6 of the output's scale a layer."""
+"""The same float32 network with another batch size or number of threads: its sums of up to 300
+terms, rounded to 6e-8 each and added up in another order, differ by about 6e-8 sqrt(300) = 1e-6 of
+the output's scale a layer."""
 
 
 @pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
@@ -178,7 +201,9 @@ def test_many_frames_and_bf16(tmp_path, trained):
 
 def test_divergence_names_the_batch(tmp_path, trained):
     rule = {"name": "rmsprop", "learning_rate": 1e30, "alpha": 0.99, "weight_decay": 1e-5}
-    with pytest.raises(TrainingError, match=r"training diverged: loss .* in epoch 1, batch 2, samples \w+_A\d+"):
+    with pytest.raises(
+        TrainingError, match=r"training diverged: loss .* in epoch 1, batch 2, samples \w+_A\d+"
+    ):
         trained(tmp_path / "run", small(optimizer=rule))
 
 
@@ -192,16 +217,33 @@ def test_a_validation_loss_that_runs_away_ends_it(tmp_path, trained):
 
 @pytest.mark.processes
 def test_two_processes_agree(tiny, tmp_path):
-    """accelerate's launcher on two processors: one set of files, and a log that both have a part in."""
+    """accelerate's launcher on two processors: one set of files, and a log that both have a part
+    in."""
     (tmp_path / "mine.yaml").write_text(
         f"extends: loss/l1\nsize: {TINY_SIZE}\nwidth: 2\nmax_epochs: 1\nbatch: 2\n"
         "pairs_per_epoch: 4\nvalidation_pairs: 3\n"
     )
     code = "from accelerate.commands.launch import main; main()"
     options = "--cpu --num_processes 2 --num_machines 1 --mixed_precision no --dynamo_backend no"
-    command = ["-m", "fpp_ml_bench", "train", tmp_path / "mine.yaml", tiny, "--out", tmp_path / "run"]
+    command = [
+        "-m",
+        "fpp_ml_bench",
+        "train",
+        tmp_path / "mine.yaml",
+        tiny,
+        "--out",
+        tmp_path / "run",
+    ]
     done = subprocess.run(
-        [sys.executable, "-c", code, *options.split(), "--main_process_port", "0", *map(str, command)],
+        [
+            sys.executable,
+            "-c",
+            code,
+            *options.split(),
+            "--main_process_port",
+            "0",
+            *map(str, command),
+        ],
         cwd=Path(__file__).resolve().parent.parent,
         capture_output=True,
         text=True,
@@ -212,7 +254,9 @@ def test_two_processes_agree(tiny, tmp_path):
     assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl"}
     record = read_json(tmp_path / "run" / "log.jsonl")
     assert math.isfinite(record["validation_loss"])
-    scores = validation_of(tmp_path / "run" / WEIGHTS, tiny, load_recipe(tmp_path / "mine.yaml", "small"))[1]
+    scores = validation_of(
+        tmp_path / "run" / WEIGHTS, tiny, load_recipe(tmp_path / "mine.yaml", "small")
+    )[1]
     for key in SCORES:  # means over the three pairs of both processes
         assert record[key] == pytest.approx(scores[key], rel=FLOAT32), key
 
@@ -222,7 +266,9 @@ def test_nothing_that_is_not_finite_is_kept(tmp_path, monkeypatch, trained):
     from fpp_ml_bench.baselines.networks.unet import UNet
 
     forward = UNet.forward
-    monkeypatch.setattr(UNet, "forward", lambda self, x: forward(self, x) * (1.0 if self.training else math.nan))
+    monkeypatch.setattr(
+        UNet, "forward", lambda self, x: forward(self, x) * (1.0 if self.training else math.nan)
+    )
     with pytest.raises(TrainingError, match=r"the network's answer to \w+_A\d+ is not finite"):
         trained(tmp_path / "run")
     assert not (tmp_path / "run" / WEIGHTS).exists()
@@ -231,9 +277,13 @@ def test_nothing_that_is_not_finite_is_kept(tmp_path, monkeypatch, trained):
 def test_refusals(uninterrupted, tmp_path, trained):
     folder = tmp_path / "run"
     shutil.copytree(uninterrupted.weights.parent, folder)
-    with pytest.raises(TrainingError, match="differs in normalisation, optimizer; give another folder"):
+    with pytest.raises(
+        TrainingError, match="differs in normalisation, optimizer; give another folder"
+    ):
         trained(folder, small("normalization/raw"))
-    with pytest.raises(TrainingError, match=rf"{TINY_SIZE} px, recipe .* expects 192 x 192; build the size"):
+    with pytest.raises(
+        TrainingError, match=rf"{TINY_SIZE} px, recipe .* expects 192 x 192; build the size"
+    ):
         trained(tmp_path / "other", small(size=192))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("precious")
@@ -252,7 +302,9 @@ def test_refusals(uninterrupted, tmp_path, trained):
     with pytest.raises(TrainingError, match=r"damaged .*delete .* to train again"):
         trained(folder)
     shutil.copy(uninterrupted.weights, folder / CHECKPOINT)
-    with pytest.raises(TrainingError, match="expected weights of fpp-ml-bench training, got format 'fpp-ml-bench'"):
+    with pytest.raises(
+        TrainingError, match="expected weights of fpp-ml-bench training, got format 'fpp-ml-bench'"
+    ):
         trained(folder)
 
 
@@ -277,7 +329,8 @@ def test_validation_pairs_come_evenly_from_views_and_frames():
 
 @pytest.mark.parametrize("factor", [0.5, 0.1])
 def test_training_ends_when_the_rate_is_at_its_minimum(factor):
-    """1e-4 x 0.1 x 0.1 is 1.0000000000000002e-06: a plain comparison with 1e-6 would never be true."""
+    """1e-4 x 0.1 x 0.1 is 1.0000000000000002e-06: a plain comparison with 1e-6 would never be
+    true."""
     rule = Plateau(name="plateau", factor=factor, patience=10, minimum=1e-6)
     epochs = 0
     while not at_minimum(rule, rate_after(rule, 1e-4, [1.0] * epochs)):
@@ -291,8 +344,12 @@ def test_training_ends_when_the_rate_is_at_its_minimum(factor):
 def test_a_plateau_is_torchs(patience):
     holder = torch.optim.SGD([torch.zeros(1)], lr=1e-4)
     rule = Plateau(name="plateau", factor=0.3, patience=patience, minimum=2e-6)
-    torchs = torch.optim.lr_scheduler.ReduceLROnPlateau(holder, factor=0.3, patience=patience, min_lr=2e-6, eps=0.0)
-    losses = (np.random.default_rng(patience).uniform(0.99, 1.0, 200) * np.linspace(1, 0.95, 200)).tolist()
+    torchs = torch.optim.lr_scheduler.ReduceLROnPlateau(
+        holder, factor=0.3, patience=patience, min_lr=2e-6, eps=0.0
+    )
+    losses = (
+        np.random.default_rng(patience).uniform(0.99, 1.0, 200) * np.linspace(1, 0.95, 200)
+    ).tolist()
     for epoch, loss in enumerate(losses, 1):
         holder.step()
         torchs.step(loss)
@@ -314,5 +371,7 @@ def test_the_rule_of_the_range_is_recorded_and_a_run_of_another_is_not_continued
     tensors, state = read_checkpoint(tmp_path / "run" / CHECKPOINT)
     assert state.pop("range_rule") == "valid"
     save_checkpoint(tmp_path / "run" / CHECKPOINT, tensors, state)
-    with pytest.raises(TrainingError, match="another recipe, dataset or depth range; give a new folder"):
+    with pytest.raises(
+        TrainingError, match="another recipe, dataset or depth range; give a new folder"
+    ):
         trained(tmp_path / "run", recipe)

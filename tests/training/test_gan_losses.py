@@ -20,7 +20,10 @@ def test_scores_and_features_against_numpy():
     rng = np.random.default_rng(0)
 
     def answers():
-        return [[torch.from_numpy(rng.normal(size=(2, channels, 4, 4))) for channels in (3, 5, 1)] for _ in range(2)]
+        return [
+            [torch.from_numpy(rng.normal(size=(2, channels, 4, 4))) for channels in (3, 5, 1)]
+            for _ in range(2)
+        ]
 
     generated, real = answers(), answers()
     expected = sum(((scale[-1].numpy() - 1) ** 2).mean() for scale in generated)
@@ -28,7 +31,10 @@ def test_scores_and_features_against_numpy():
     expected = sum((scale[-1].numpy() ** 2).mean() for scale in generated)
     assert scores_against(generated, real=False).item() == pytest.approx(expected)
     expected = np.mean(
-        [sum(abs(g[layer] - r[layer]).mean() for layer in (0, 1)) for g, r in zip(generated, real, strict=True)]
+        [
+            sum(abs(g[layer] - r[layer]).mean() for layer in (0, 1))
+            for g, r in zip(generated, real, strict=True)
+        ]
     )
     assert feature_matching(generated, real).item() == pytest.approx(expected)
     assert feature_matching(real, real) == 0
@@ -48,7 +54,8 @@ def test_gradient_l1_of_a_ramp_and_of_an_offset():
 
 
 def test_scale_invariant_log_of_a_wrong_scale_is_half_its_squared_logarithm():
-    """With lambda 1/2, log p = log t + c everywhere on the object costs c^2 / 2; the background costs nothing."""
+    """With lambda 1/2, log p = log t + c everywhere on the object costs c^2 / 2; the background
+    costs nothing."""
     floor = LOG_FLOOR
     target = torch.rand(2, 1, 6, 6, dtype=torch.float64) * 0.4 + 0.1
     target[:, :, :2] = 0

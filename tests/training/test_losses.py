@@ -1,4 +1,5 @@
-"""The losses against the paper's equations in NumPy float64, their gradients, and what they must never hide."""
+"""The losses against the paper's equations in NumPy float64, their gradients, and what they must
+never hide."""
 
 import math
 
@@ -63,13 +64,14 @@ def test_a_sample_is_a_batch_of_its_own_and_not_a_share_of_the_pool(name, alpha)
 @pytest.mark.parametrize("name", ["rmse", "masked_l1"])
 def test_float32_sums_hold_at_full_size_in_mm(name):
     prediction, target = images(4, 960, 960, scale=2100.0, dtype=torch.float32)
-    # Errors of one sign and size, hundreds of mm: the case in which a running float32 sum would lose most.
+    # Errors of one sign and size, hundreds of mm: the case in which a running float32 sum would
+    # lose most.
     shifted = prediction.abs() + 800
     expected = loss_function(name)(shifted.double(), target.double())
     value = loss_function(name)(shifted, target)
     assert value.dtype == torch.float32
-    # Torch adds n terms in a tree of log2(n) levels, each with a rounding of eps / 2: 22 levels for 3.7 million pixels
-    # make 1.3e-6 at worst, if all roundings have one sign; 6e-8 was measured.
+    # Torch adds n terms in a tree of log2(n) levels, each with a rounding of eps / 2: 22 levels for
+    # 3.7 million pixels make 1.3e-6 at worst, if all roundings have one sign; 6e-8 was measured.
     assert value.item() == pytest.approx(expected.item(), rel=1e-6)
 
 
@@ -89,8 +91,11 @@ def test_half_precision_overflows_nowhere(name, alpha, dtype):
     value = loss_function(name, alpha)(prediction, target)
     value.backward()
     assert value.dtype == torch.float32
-    # Sums of 462 float32 terms, in whatever order: 84 eps, where 462 is the most that any order can lose.
-    assert value.item() == pytest.approx(paper(name, alpha, prediction.detach().float(), target.float()), rel=1e-5)
+    # Sums of 462 float32 terms, in whatever order: 84 eps, where 462 is the most that any order can
+    # lose.
+    assert value.item() == pytest.approx(
+        paper(name, alpha, prediction.detach().float(), target.float()), rel=1e-5
+    )
     assert prediction.grad.dtype == dtype
     assert prediction.grad.isfinite().all() and prediction.grad.any()
 

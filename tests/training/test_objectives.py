@@ -1,4 +1,5 @@
-"""Objectives as the engine drives them: every module gets its own gradient, the discriminator really learns."""
+"""Objectives as the engine drives them: every module gets its own gradient, the discriminator
+really learns."""
 
 import math
 
@@ -26,7 +27,9 @@ class Generator(nn.Module):
     def __init__(self):
         super().__init__()
         self.calls = 0
-        self.layers = nn.Sequential(nn.Conv2d(1, 8, 3, padding=1), nn.ReLU(), nn.Conv2d(8, 1, 3, padding=1), nn.Tanh())
+        self.layers = nn.Sequential(
+            nn.Conv2d(1, 8, 3, padding=1), nn.ReLU(), nn.Conv2d(8, 1, 3, padding=1), nn.Tanh()
+        )
 
     def forward(self, fringe):
         self.calls += 1
@@ -40,7 +43,9 @@ class Discriminator(nn.Module):
         super().__init__()
         self.inputs = []
         self.scales = nn.ModuleList(
-            nn.ModuleList([nn.Conv2d(2, 8, 4, 2, 1), nn.Conv2d(8, 8, 4, 2, 1), nn.Conv2d(8, 1, 4, 1, 1)])
+            nn.ModuleList(
+                [nn.Conv2d(2, 8, 4, 2, 1), nn.Conv2d(8, 8, 4, 2, 1), nn.Conv2d(8, 1, 4, 1, 1)]
+            )
             for _ in range(2)
         )
 
@@ -50,7 +55,11 @@ class Discriminator(nn.Module):
         for layers in self.scales:
             features = [pair]
             for layer in layers:
-                features.append(functional.leaky_relu(layer(features[-1]), 0.2 if layer is not layers[-1] else 1.0))
+                features.append(
+                    functional.leaky_relu(
+                        layer(features[-1]), 0.2 if layer is not layers[-1] else 1.0
+                    )
+                )
             answers.append(features[1:])
             pair = functional.avg_pool2d(pair, 2)
         return answers
@@ -62,7 +71,8 @@ def seeded():
 
 
 def batch(count=2, seed=0, empty=False):
-    """Fringes across a square object whose depth follows them, so that there is something to learn."""
+    """Fringes across a square object whose depth follows them, so that there is something to
+    learn."""
     generator = torch.Generator().manual_seed(seed)
     phase = torch.rand(count, 1, 1, 1, generator=generator) * 2 * math.pi
     columns = torch.arange(SIZE, dtype=torch.float32).expand(count, 1, SIZE, SIZE)
@@ -71,7 +81,9 @@ def batch(count=2, seed=0, empty=False):
     if not empty:
         depth[:, :, 8:24, 8:24] = fringe[:, :, 8:24, 8:24]
     rows = torch.arange(count)
-    return FringeDepth(fringe, depth, torch.tensor([[1500.0, 1700.0]] * count), rows, torch.zeros_like(rows))
+    return FringeDepth(
+        fringe, depth, torch.tensor([[1500.0, 1700.0]] * count), rows, torch.zeros_like(rows)
+    )
 
 
 def adversarial():
@@ -79,7 +91,10 @@ def adversarial():
 
 
 def optimisers(objective, rate=1e-3):
-    return {name: torch.optim.RMSprop(module.parameters(), rate) for name, module in objective.modules.items()}
+    return {
+        name: torch.optim.RMSprop(module.parameters(), rate)
+        for name, module in objective.modules.items()
+    }
 
 
 def take(objective, optimiser, one_batch):
@@ -113,7 +128,9 @@ def test_regression_is_its_loss_on_its_network():
     assert logged == {"loss": expected.detach()}
     prediction = network(sample_batch.fringe).detach()
     values = objective.validation_losses(prediction, sample_batch)
-    assert torch.equal(values, sample_losses("hybrid_l1", 0.7, prediction, sample_batch.depth)) and values.shape == (2,)
+    assert torch.equal(
+        values, sample_losses("hybrid_l1", 0.7, prediction, sample_batch.depth)
+    ) and values.shape == (2,)
 
 
 def test_unknown_losses_are_refused_before_training():
@@ -175,16 +192,21 @@ def test_frozen_parameters_stay_frozen_and_free_ones_are_freed_after_an_error():
     discriminator.forward = None
     with pytest.raises(TypeError):
         next(steps)
-    assert [parameter.requires_grad for parameter in discriminator.parameters()] == [False] + [True] * 11
+    assert [parameter.requires_grad for parameter in discriminator.parameters()] == [False] + [
+        True
+    ] * 11
 
 
 def test_the_discriminator_learns_on_two_fixed_distributions():
-    """A generator that stands still: the loss must fall from guessing (0.5 with two scales) to telling them apart."""
+    """A generator that stands still: the loss must fall from guessing (0.5 with two scales) to
+    telling them apart."""
     objective = adversarial()
     optimiser = optimisers(objective)
     optimiser["network"] = torch.optim.SGD(objective.modules["network"].parameters(), lr=0.0)
     before = weights(objective.modules["discriminator"])
-    losses = [take(objective, optimiser, batch(seed=step))["discriminator"].item() for step in range(80)]
+    losses = [
+        take(objective, optimiser, batch(seed=step))["discriminator"].item() for step in range(80)
+    ]
     assert losses[0] > 0.4
     assert max(losses[-10:]) < 0.1
     assert not torch.equal(weights(objective.modules["discriminator"]), before)
@@ -198,7 +220,8 @@ def test_the_discriminator_learns_on_two_fixed_distributions():
 
 
 def test_the_generator_learns_from_the_discriminator_alone():
-    """Without depth terms, the only way to fool the discriminator is a depth that looks like the batch's."""
+    """Without depth terms, the only way to fool the discriminator is a depth that looks like the
+    batch's."""
     settings = AdversarialSettings(l1=0, gradient_l1=0, scale_invariant_log=0)
     objective = Adversarial(Generator(), Discriminator(), settings)
     optimiser = optimisers(objective)
@@ -215,8 +238,12 @@ def test_the_discriminator_sees_fringe_and_depth_in_minus_one_to_one():
     list(objective.steps(sample_batch))
     pairs, generated, real = discriminator.inputs
     assert torch.equal(pairs, torch.cat([generated, real]))
-    assert torch.equal(real, torch.cat([sample_batch.fringe * 2 - 1, sample_batch.depth * 2 - 1], dim=1))
-    assert torch.equal(generated, torch.cat([sample_batch.fringe * 2 - 1, predicted * 2 - 1], dim=1))
+    assert torch.equal(
+        real, torch.cat([sample_batch.fringe * 2 - 1, sample_batch.depth * 2 - 1], dim=1)
+    )
+    assert torch.equal(
+        generated, torch.cat([sample_batch.fringe * 2 - 1, predicted * 2 - 1], dim=1)
+    )
 
 
 def test_the_generators_loss_is_the_weighted_sum():
@@ -224,10 +251,18 @@ def test_the_generators_loss_is_the_weighted_sum():
     (_, discriminator_loss, parts), (_, loss, terms) = objective.steps(batch())
     halves = parts["discriminator_generated"] + parts["discriminator_real"]
     assert discriminator_loss.item() == pytest.approx(halves.item() / 2)
-    expected = {"adversarial": 1, "feature_matching": 10, "l1": 10, "gradient_l1": 5, "scale_invariant_log": 2}
+    expected = {
+        "adversarial": 1,
+        "feature_matching": 10,
+        "l1": 10,
+        "gradient_l1": 5,
+        "scale_invariant_log": 2,
+    }
     expected |= {"hybrid_l1": 0}  # logged, of no weight for pix2pixHD
     assert set(terms) == {"loss", *expected}
-    assert loss.item() == pytest.approx(sum(weight * terms[name].item() for name, weight in expected.items()))
+    assert loss.item() == pytest.approx(
+        sum(weight * terms[name].item() for name, weight in expected.items())
+    )
     assert terms["loss"] == loss.detach()
 
 
@@ -235,7 +270,9 @@ def test_with_alpha_the_hybrid_l1_takes_the_place_of_the_depth_terms():
     objective = Adversarial(Generator(), Discriminator(), AdversarialSettings.of(0.7))
     _, (_, loss, terms) = objective.steps(batch())
     expected = {"adversarial": 1, "feature_matching": 10, "hybrid_l1": 200}
-    assert loss.item() == pytest.approx(sum(weight * terms[name].item() for name, weight in expected.items()))
+    assert loss.item() == pytest.approx(
+        sum(weight * terms[name].item() for name, weight in expected.items())
+    )
     assert AdversarialSettings.of(None) == AdversarialSettings()
 
 
@@ -252,11 +289,16 @@ def test_gradients_are_finite_without_an_object():
     sample_batch = batch(empty=True)
     for constant in (0.0, 1.0):
         fringe = torch.full_like(sample_batch.fringe, constant).to(dtype)
-        for name, loss, _ in objective.steps(sample_batch._replace(fringe=fringe, depth=sample_batch.depth.to(dtype))):
+        for name, loss, _ in objective.steps(
+            sample_batch._replace(fringe=fringe, depth=sample_batch.depth.to(dtype))
+        ):
             assert loss.dtype == torch.float32 and loss.isfinite()
             objective.modules[name].zero_grad()
             loss.backward()
-            assert all(parameter.grad.isfinite().all() for parameter in objective.modules[name].parameters())
+            assert all(
+                parameter.grad.isfinite().all()
+                for parameter in objective.modules[name].parameters()
+            )
 
 
 @pytest.mark.parametrize("place", [(0, 0), (15, 15)], ids=["background", "object"])
@@ -270,7 +312,8 @@ def test_nan_reaches_the_loss(place):
 
 
 def test_spread_over_processes_it_is_the_same_training(tmp_path):
-    """DistributedDataParallel stops where a forward has no backward, or a parameter gets no gradient."""
+    """DistributedDataParallel stops where a forward has no backward, or a parameter gets no
+    gradient."""
 
     def losses(wrap):
         torch.manual_seed(3)
@@ -281,7 +324,9 @@ def test_spread_over_processes_it_is_the_same_training(tmp_path):
         return [take(objective, optimiser, batch(seed=step)) for step in range(3)]
 
     alone = losses(lambda module: module)
-    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/rendezvous", rank=0, world_size=1)
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{tmp_path}/rendezvous", rank=0, world_size=1
+    )
     try:
         assert losses(nn.parallel.DistributedDataParallel) == alone
     finally:
@@ -289,7 +334,8 @@ def test_spread_over_processes_it_is_the_same_training(tmp_path):
 
 
 def test_one_autocast_around_both_steps_uses_the_updated_discriminator():
-    """autocast keeps bfloat16 copies of weights until it ends: the generator must not be judged by outdated ones."""
+    """autocast keeps bfloat16 copies of weights until it ends: the generator must not be judged by
+    outdated ones."""
 
     def losses(around_all):
         torch.manual_seed(3)

@@ -34,9 +34,16 @@ def test_further_directions_differ_from_the_plain_unet_in_one_thing():
     )
     assert load_recipe("further/physics").name == "unet-global-rmse_physics_0.05"
     with pytest.raises(RecipeError, match="physics needs depth in mm or m"):
-        recipe_from_dict({**load_recipe("further/physics").to_dict(), "normalisation": "individual"})
+        recipe_from_dict(
+            {**load_recipe("further/physics").to_dict(), "normalisation": "individual"}
+        )
     with pytest.raises(RecipeError, match="gan takes no physics"):
-        recipe_from_dict({**load_recipe("architecture/pix2pix").to_dict(), "loss": {"name": "gan", "physics": 1.0}})
+        recipe_from_dict(
+            {
+                **load_recipe("architecture/pix2pix").to_dict(),
+                "loss": {"name": "gan", "physics": 1.0},
+            }
+        )
 
 
 def test_every_row_of_the_paper_has_a_recipe():
@@ -53,7 +60,9 @@ def test_every_row_of_the_paper_has_a_recipe():
         assert [row.row for row in table.rows] == [
             row for row in table_rows(name) if row not in ("hformer", "pix2pixhd")
         ]
-    shipped = sorted(str(path.relative_to(RECIPES).with_suffix("")) for path in RECIPES.glob("*/*.yaml"))
+    shipped = sorted(
+        str(path.relative_to(RECIPES).with_suffix("")) for path in RECIPES.glob("*/*.yaml")
+    )
     assert shipped == sorted([*NAMES, *(f"presets/{preset}" for preset in PRESETS)])
 
 
@@ -78,12 +87,17 @@ def test_rows_of_a_table_differ_in_what_the_table_is_about(table, preset):
         "architecture": {"network", "width", "options", "loss", "schedule"},
         "further": {"options", "loss"},
     }[table]
-    if table in ("normalization", "background_removed"):  # raw targets need a higher rate in the small presets
+    if table in (
+        "normalization",
+        "background_removed",
+    ):  # raw targets need a higher rate in the small presets
         about |= {"small": {"optimizer"}, "paper": set()}[preset]
     rows = [load_recipe(f"{table}/{row}", preset).to_dict() for row in table_rows(table)]
     differing = {key for row in rows for key in row if row[key] != rows[0][key]}
     assert differing <= about
-    assert len({load_recipe(f"{table}/{row}", preset).digest for row in table_rows(table)}) == len(rows)
+    assert len({load_recipe(f"{table}/{row}", preset).digest for row in table_rows(table)}) == len(
+        rows
+    )
 
 
 def test_all_rows_of_the_small_preset_have_one_schedule():
@@ -98,7 +112,9 @@ def test_seeds_and_folds_have_names_of_their_own():
     assert further_seeds(recipe) == [1, 2] and further_seeds(load_recipe("loss/l1")) == []
     assert further_seeds(load_recipe("normalization/raw", "paper")) == []
     other = recipe_from_dict({**recipe.to_dict(), "seed": 1, "fold": [2, 5]})
-    assert other.name == "unet-raw-rmse-seed_1-fold_2_of_5" and other.title.endswith("seed 1, fold 2 of 5")
+    assert other.name == "unet-raw-rmse-seed_1-fold_2_of_5" and other.title.endswith(
+        "seed 1, fold 2 of 5"
+    )
     with pytest.raises(RecipeError, match="expected a part from 0 to 4, got 5"):
         recipe_from_dict({**recipe.to_dict(), "fold": [5, 5]})
 
@@ -107,7 +123,11 @@ def test_rows_that_are_one_training():
     digest = load_recipe("normalization/individual").digest
     assert load_recipe("loss/rmse").digest == load_recipe("multi_frame/frame0").digest == digest
     assert load_recipe("architecture/unet").digest == load_recipe("loss/hybrid_l1_0.7").digest
-    assert len({load_recipe(name).name for name in NAMES}) == len({load_recipe(name).digest for name in NAMES}) == 26
+    assert (
+        len({load_recipe(name).name for name in NAMES})
+        == len({load_recipe(name).digest for name in NAMES})
+        == 26
+    )
 
 
 def test_background_is_removed_in_its_table_alone():
@@ -120,7 +140,9 @@ def test_the_gan_has_its_own_schedule():
         recipe = load_recipe(f"architecture/{name}", "paper")
         assert recipe.schedule == Linear(name="linear", constant=100, decay=100)
     assert (recipe.network, recipe.loss.label) == ("pix2pix", "gan")
-    assert load_recipe("architecture/pix2pix", "small").loss.label == "gan_0.7"  # the table's caption: hybrid L1
+    assert (
+        load_recipe("architecture/pix2pix", "small").loss.label == "gan_0.7"
+    )  # the table's caption: hybrid L1
     assert load_recipe("architecture/pix2pix", "small").options == {"levels": 5}
 
 
@@ -164,7 +186,9 @@ def test_a_recipe_of_yours(tmp_path):
 )
 def test_refused(tmp_path, text, message):
     own_recipe = tmp_path / "mine.yaml"
-    own_recipe.write_text(text if "extends" in text or text.startswith("-") else f"extends: base\n{text}")
+    own_recipe.write_text(
+        text if "extends" in text or text.startswith("-") else f"extends: base\n{text}"
+    )
     with pytest.raises(RecipeError, match=message):
         load_recipe(own_recipe)
 

@@ -30,7 +30,9 @@ def test_there_are_some_and_they_are_small():
 def views():
     """A test object's views, rendered as in the benchmark of the weights."""
     studio = Studio(BuildSettings(rig=paper_rig(224), objects=(OBJECT,)))
-    return [deepcopy(studio.photograph(solid_mesh(OBJECT), view)) for view in VIEWS]  # it uses its arrays again
+    return [
+        deepcopy(studio.photograph(solid_mesh(OBJECT), view)) for view in VIEWS
+    ]  # it uses its arrays again
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -46,8 +48,15 @@ def test_each_is_its_recipe_and_gives_the_score_of_its_row(name, views):
         void = void_pixels(view.flags, view.depth_mm, view.depth_exact_mm)
         left_out = void if model.config.range_rule == "valid" else None
         pair = scored_pair(
-            model.predict(view.frames[0]), view.depth_mm, row.submission.units, row.mode, OBJECT, left_out
+            model.predict(view.frames[0]),
+            view.depth_mm,
+            row.submission.units,
+            row.mode,
+            OBJECT,
+            left_out,
         )
         scores.append(score_sample(*pair, void=void if row.mode == "standard" else None).metrics())
     for key in ("object_mae_mm", "background_mae_mm", "overall_mae_mm"):
-        assert fmean(view[key] for view in scores) == pytest.approx(getattr(expected, key), rel=0.01)
+        assert fmean(view[key] for view in scores) == pytest.approx(
+            getattr(expected, key), rel=0.01
+        )

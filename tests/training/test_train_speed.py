@@ -15,7 +15,9 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 def data(tmp_path_factory):
     """One training object as a dataset and as the published tree."""
     folder = tmp_path_factory.mktemp("train_speed")
-    build(folder / "dataset", tiny_settings(stored="single_shot", objects=("bowl", "mug")), workers=1)
+    build(
+        folder / "dataset", tiny_settings(stored="single_shot", objects=("bowl", "mug")), workers=1
+    )
     write_tree(DatasetFolder(folder / "dataset"), folder / "tree", ["train"], 1)
     return folder / "dataset", folder / "tree"
 
@@ -44,15 +46,20 @@ def test_a_difference_is_noticed(ways, data):
     content = reader.depths[2].read_bytes()
     depth = scipy.io.loadmat(reader.depths[2])["depthMapNormalized"]
     try:
-        scipy.io.savemat(reader.depths[2], {"depthMapNormalized": np.where(depth > 0, depth + 0.001, 0)})
-        with pytest.raises(SystemExit, match=f"{reader.depths[2].stem}: the two ways read different numbers"):
+        scipy.io.savemat(
+            reader.depths[2], {"depthMapNormalized": np.where(depth > 0, depth + 0.001, 0)}
+        )
+        with pytest.raises(
+            SystemExit, match=f"{reader.depths[2].stem}: the two ways read different numbers"
+        ):
             train_speed.check_same(dataset, tree)
     finally:
         reader.depths[2].write_bytes(content)
 
 
 def test_an_epoch_of_each(ways, data, tmp_path):
-    """From the same weights, over the same six pairs in orders of their own: nearly the same loss."""
+    """From the same weights, over the same six pairs in orders of their own: nearly the same
+    loss."""
     dataset, tree = data
     losses = []
     for kind, folder in ((ways.Plain, tree), (ways.Ours, dataset)):

@@ -1,4 +1,5 @@
-"""Weights say which benchmark they were trained on, and a mismatch with the dataset at hand is one sentence."""
+"""Weights say which benchmark they were trained on, and a mismatch with the dataset at hand is one
+sentence."""
 
 import json
 from dataclasses import replace
@@ -30,7 +31,14 @@ from fpp_ml_bench.loaders.storage import benchmark
 from fpp_ml_bench.loaders.storage.benchmark import Benchmark
 
 OLD = "a" * 64
-NET_OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0, "uncertain": True}
+NET_OPTIONS = {
+    "widths": [4, 6],
+    "fine": 4,
+    "squeezed": 6,
+    "order_widths": [4, 6],
+    "bound_rad": 1.0,
+    "uncertain": True,
+}
 
 
 @pytest.fixture
@@ -52,7 +60,9 @@ def save_phase_net(path, **changes):
         "dataset_fingerprint": "0" * 64,
         "recipe": {"albedo": "one"},
     }
-    save_weights(path, PhaseNet(**NET_OPTIONS), NetConfig(**{**content, **changes}), family=PHASE_NETWORKS)
+    save_weights(
+        path, PhaseNet(**NET_OPTIONS), NetConfig(**{**content, **changes}), family=PHASE_NETWORKS
+    )
 
 
 def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
@@ -71,7 +81,9 @@ def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
 
 def test_a_file_without_the_entry_is_read(tmp_path):
     """A shipped network names the version that it was trained on; an older file says nothing."""
-    named = {open_weights(SHIPPED / f"{name}.safetensors").config.benchmark for name in shipped_names()}
+    named = {
+        open_weights(SHIPPED / f"{name}.safetensors").config.benchmark for name in shipped_names()
+    }
     assert named == {TrainingBenchmark("fpp-bench-full-224", 2)}
     assert load_net().config.benchmark == TrainingBenchmark("phase-net views", 1)
     path = tmp_path / "net.safetensors"
@@ -88,8 +100,17 @@ def test_a_file_without_the_entry_is_read(tmp_path):
     "fingerprint, trained_on, words",
     [
         ("same", TrainingBenchmark("tiny", 0), None),
-        (OLD, None, "trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on tiny version 1"),
-        (OLD, TrainingBenchmark("tiny", 0), "trained on tiny version 0; predicting on tiny version 1"),
+        (
+            OLD,
+            None,
+            "trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on "
+            "tiny version 1",
+        ),
+        (
+            OLD,
+            TrainingBenchmark("tiny", 0),
+            "trained on tiny version 0; predicting on tiny version 1",
+        ),
         (OLD, TrainingBenchmark("large", 7), None),
     ],
 )
@@ -100,12 +121,21 @@ def test_what_is_said_on_a_named_benchmark(benchmarks, opened, fingerprint, trai
 
 
 def test_other_bytes_of_a_benchmarks_settings_are_said(benchmarks, opened, monkeypatch):
-    """A dataset that was built with a benchmark's settings, and differs from it: on another processor, say."""
+    """A dataset that was built with a benchmark's settings, and differs from it: on another
+    processor, say."""
     manifest = replace(opened.manifest, content={**opened.content, "test/depth": "0" * 32})
     monkeypatch.setattr(training_data, "intended_benchmark", lambda manifest: benchmarks[0])
-    config = config_of(tiny_network(), dataset_fingerprint="d" * 64, benchmark=TrainingBenchmark("tiny", 1))
-    dataset = f"dataset {manifest.fingerprint[:8]}, which has the settings of tiny version 1 but other content"
-    assert training_data_warning(config, manifest) == f"trained on tiny version 1; predicting on {dataset}"
+    config = config_of(
+        tiny_network(), dataset_fingerprint="d" * 64, benchmark=TrainingBenchmark("tiny", 1)
+    )
+    dataset = (
+        f"dataset {manifest.fingerprint[:8]}, which has the settings of tiny version 1 but other "
+        f"content"
+    )
+    assert (
+        training_data_warning(config, manifest)
+        == f"trained on tiny version 1; predicting on {dataset}"
+    )
 
 
 def test_nothing_is_said_on_data_of_the_users_own(opened):
@@ -116,20 +146,39 @@ def test_nothing_is_said_on_data_of_the_users_own(opened):
 @pytest.mark.parametrize(
     ("command", "method"), [("predict", "network"), ("time", "phase-net"), ("predict", "classical")]
 )
-def test_the_commands_warn_once_and_go_on(benchmarks, opened, tiny, tmp_path, capsys, command, method):
-    options = ["--out", tmp_path / "predictions"] if command == "predict" else ["--repeats", 1, "--batch", 1]
+def test_the_commands_warn_once_and_go_on(
+    benchmarks, opened, tiny, tmp_path, capsys, command, method
+):
+    options = (
+        ["--out", tmp_path / "predictions"]
+        if command == "predict"
+        else ["--repeats", 1, "--batch", 1]
+    )
     if method == "network":
         config = config_of(
-            tiny_network(), normalisation="global", image_size=opened.size, dataset_fingerprint=OLD, name="mine"
+            tiny_network(),
+            normalisation="global",
+            image_size=opened.size,
+            dataset_fingerprint=OLD,
+            name="mine",
         )
         save_weights(tmp_path / "mine.safetensors", tiny_network(), config)
         method = tmp_path / "mine.safetensors"
     if method == "phase-net":
         period_px = opened.rig.image_px_per_period("horizontal")
-        save_phase_net(tmp_path / "net.safetensors", period_px={"horizontal": period_px}, dataset_fingerprint=OLD)
+        save_phase_net(
+            tmp_path / "net.safetensors",
+            period_px={"horizontal": period_px},
+            dataset_fingerprint=OLD,
+        )
         options += ["--weights", tmp_path / "net.safetensors"]
     assert fpp_bench(*[str(argument) for argument in (command, method, tiny, *options)]) == 0
-    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    warnings = [
+        line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")
+    ]
     name = {"classical": None, "phase-net": "phase-net"}.get(str(method), "mine")
-    expected = "was trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on tiny version 1"
+    expected = (
+        "was trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on "
+        "tiny version 1"
+    )
     assert warnings == ([] if name is None else [f"warning: {name} {expected}"])

@@ -1,8 +1,16 @@
-"""The views that the phase networks learn from: drawn lights, splits that stay apart, unions of objects."""
+"""The views that the phase networks learn from: drawn lights, splits that stay apart, unions of
+objects."""
 
 import numpy as np
 
-from fpp_ml_bench.baselines.learned.scenes import View, companions, drawn_light, groups_of, united, with_unions
+from fpp_ml_bench.baselines.learned.scenes import (
+    View,
+    companions,
+    drawn_light,
+    groups_of,
+    united,
+    with_unions,
+)
 
 
 def test_drawn_lights_differ_and_repeat() -> None:
@@ -11,25 +19,36 @@ def test_drawn_lights_differ_and_repeat() -> None:
     exposures = [light.camera.exposure for light in lights]
     assert min(exposures) < 0.35 and max(exposures) > 1.5
     assert {light.surface.textures for light in lights} == {"none", "by_kind", "checks"}
-    assert any(light.bounces.shadows for light in lights) and any(light.projector.response != 1 for light in lights)
+    assert any(light.bounces.shadows for light in lights) and any(
+        light.projector.response != 1 for light in lights
+    )
 
 
 def test_groups_keep_the_splits_apart() -> None:
     groups = groups_of(lights=3, views_a_light=4, seed=0)
     splits = "train", "validation"
-    shown = {split: {name for g in groups if g.split == split for name, _ in g.views} for split in splits}
+    shown = {
+        split: {name for g in groups if g.split == split for name, _ in g.views} for split in splits
+    }
     assert len(shown["train"]) == 40 and len(shown["validation"]) == 5
     assert not shown["train"] & shown["validation"]
-    assert all(len({name for name, _ in g.views}) == 4 for g in groups if g.name.startswith("drawn"))
+    assert all(
+        len({name for name, _ in g.views}) == 4 for g in groups if g.name.startswith("drawn")
+    )
 
 
 def test_most_lights_show_one_material_where_that_is_asked_for() -> None:
     groups = groups_of(lights=6, views_a_light=4, seed=0, textured_every=3, validation_lights=3)
     drawn = [group.light.surface for group in groups if group.name.startswith(("plain", "drawn"))]
-    assert [(surface.textures, surface.gloss) == ("none", 0) for surface in drawn[:2]] == [True, True]
+    assert [(surface.textures, surface.gloss) == ("none", 0) for surface in drawn[:2]] == [
+        True,
+        True,
+    ]
     assert len(drawn) == 6 and sum(group.name.startswith("drawn") for group in groups) == 2
     every = groups_of(lights=6, views_a_light=4, seed=0)
-    assert drawn[2] == every[3].light.surface and [group.views for group in every[:7]] == [g.views for g in groups[:7]]
+    assert drawn[2] == every[3].light.surface and [group.views for group in every[:7]] == [
+        g.views for g in groups[:7]
+    ]
     assert sum(group.split == "validation" for group in groups) == 5
 
 
@@ -41,8 +60,18 @@ def test_unions_follow_their_group() -> None:
     views = [view("a", "x", 1700), view("b", "x", 1900), view("c", "y", 1600)]
     seen = list(with_unions(views, unions=2, seed=3))
     assert [item.name for item in seen if not item.united] == ["a", "b", "c"]
-    assert [item.united for item in seen] == [False, False, True, True, True, True, False]  # c is alone in its light
-    assert all((item.depth_mm == 1700).all() and not item.void.any() for item in seen if item.united)
+    assert [item.united for item in seen] == [
+        False,
+        False,
+        True,
+        True,
+        True,
+        True,
+        False,
+    ]  # c is alone in its light
+    assert all(
+        (item.depth_mm == 1700).all() and not item.void.any() for item in seen if item.united
+    )
 
 
 def test_a_union_shows_the_nearest_surface_and_keeps_shadows() -> None:
@@ -51,7 +80,9 @@ def test_a_union_shows_the_nearest_surface_and_keeps_shadows() -> None:
     empty, nothing = np.full(shape, 90, np.uint8), np.zeros(shape, bool)
     rows, columns = np.indices(shape)
     depths = [np.where(rows < 5, 1700, 0), np.where(columns > 2, 1650 + 25 * rows, 0)]
-    images = [np.where(depth > 0, random.integers(100, 200, shape, np.uint8), empty) for depth in depths]
+    images = [
+        np.where(depth > 0, random.integers(100, 200, shape, np.uint8), empty) for depth in depths
+    ]
     images[1][7, 0] = 0
     both = [
         View(name, name, "x", image[None], depth.astype(np.float32), nothing)

@@ -54,7 +54,11 @@ def config_with(path, **changes):
 def test_what_goes_in_comes_out(saved, network):
     file = open_weights(saved)
     config, tensors = file.config, file.network.state_dict()
-    assert config == config_of(network) and config.image_size == (32, 48) and config.recipe["loss"]["alpha"] == 0.7
+    assert (
+        config == config_of(network)
+        and config.image_size == (32, 48)
+        and config.recipe["loss"]["alpha"] == 0.7
+    )
     assert tensors.keys() == network.state_dict().keys()
     for name, tensor in network.state_dict().items():
         assert torch.equal(tensors[name], tensor) and tensors[name].dtype == tensor.dtype
@@ -125,11 +129,19 @@ def test_tensors_that_do_not_fit(saved, network, tmp_path):
     del tensors["extra"]
     for broken, words in (
         ({**tensors, name: tensors[name].half()}, "expected float32 .*got float16"),
-        ({**tensors, name: tensors[name] * float("nan")}, f"tensor {name} holds values that are not finite"),
-        ({key: value for key, value in tensors.items() if key != name}, f"tensor {name} is missing"),
+        (
+            {**tensors, name: tensors[name] * float("nan")},
+            f"tensor {name} holds values that are not finite",
+        ),
+        (
+            {key: value for key, value in tensors.items() if key != name},
+            f"tensor {name} is missing",
+        ),
     ):
         path = tmp_path / "broken.safetensors"
-        save_file(broken, path, {"format": "fpp-ml-bench", "version": "1", "config": config_with(saved)})
+        save_file(
+            broken, path, {"format": "fpp-ml-bench", "version": "1", "config": config_with(saved)}
+        )
         with pytest.raises(WeightsError, match=words):
             open_weights(path)
 
@@ -140,7 +152,11 @@ def test_damage_at_every_place(saved):
         saved.write_bytes(data[:cut])
         with pytest.raises(WeightsError, match=r"net\.safetensors: damaged"):
             open_weights(saved)
-    for foreign in (b"version https://git-lfs.github.com/spec/v1\n", data + b"\0", b"\x02" + bytes(7) + b"{}"):
+    for foreign in (
+        b"version https://git-lfs.github.com/spec/v1\n",
+        data + b"\0",
+        b"\x02" + bytes(7) + b"{}",
+    ):
         saved.write_bytes(foreign)
         with pytest.raises(WeightsError, match=r"net\.safetensors: (damaged|expected weights of)"):
             open_weights(saved)
@@ -153,7 +169,9 @@ def test_a_pickle_is_never_opened(tmp_path, network, zipped):
             return (pytest.fail, ("the pickle was opened",))
 
     path = tmp_path / "net.pth"
-    torch.save({"model": network.state_dict(), "trap": Trap()}, path, _use_new_zipfile_serialization=zipped)
+    torch.save(
+        {"model": network.state_dict(), "trap": Trap()}, path, _use_new_zipfile_serialization=zipped
+    )
     with pytest.raises(WeightsError, match=r"got a PyTorch pickle.*never opened"):
         open_weights(path)
 
@@ -190,13 +208,20 @@ def test_an_old_file_survives_a_failed_write(saved, network, monkeypatch):
 
 def test_names_and_paths(saved, monkeypatch, tmp_path):
     monkeypatch.setattr(weights_file, "SHIPPED", saved.parent)
-    assert weights_path("net") == saved and weights_path(saved) == saved and weights_path(str(saved)) == saved
+    assert (
+        weights_path("net") == saved
+        and weights_path(saved) == saved
+        and weights_path(str(saved)) == saved
+    )
     assert weights_path("elsewhere.safetensors").name == "elsewhere.safetensors"
     with pytest.raises(WeightsError, match=r"no weights called 'nett'.*did you mean 'net'"):
         weights_path("nett")
     with pytest.raises(WeightsError, match="'quite-another' come with this package; there are net"):
         weights_path("quite-another")
-    for path, words in ((tmp_path, "found a folder"), (tmp_path / "no.safetensors", "found nothing")):
+    for path, words in (
+        (tmp_path, "found a folder"),
+        (tmp_path / "no.safetensors", "found nothing"),
+    ):
         with pytest.raises(WeightsError, match=words):
             open_weights(path)
 
@@ -224,8 +249,14 @@ def test_a_header_that_does_not_fit_the_file_is_refused_before_the_file_is_read(
     data = saved.read_bytes()
     files = {
         "sparse": (data, "its header tells of .* bytes, it has 3000000000"),
-        "endless": ((1 << 62).to_bytes(8, "little") + data[8:], "a header of 4611686018427387904 bytes, found"),
-        "deep": ((2 << 16).to_bytes(8, "little") + b'{"a":' + b"[" * (2 << 16), "nested too deeply"),
+        "endless": (
+            (1 << 62).to_bytes(8, "little") + data[8:],
+            "a header of 4611686018427387904 bytes, found",
+        ),
+        "deep": (
+            (2 << 16).to_bytes(8, "little") + b'{"a":' + b"[" * (2 << 16),
+            "nested too deeply",
+        ),
     }
     for name, (content, said) in files.items():
         path = tmp_path / f"{name}.safetensors"

@@ -1,4 +1,5 @@
-"""Captures of a calibration board on disk, as a camera would leave them, beside the rig that took them."""
+"""Captures of a calibration board on disk, as a camera would leave them, beside the rig that took
+them."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,18 +26,22 @@ BOARD_FILE, RIG_FILE = "board.yaml", "rig.yaml"
 
 
 def board_studio(rig: Rig, board: Board, light: Light | None = None, seed: int = 42) -> Studio:
-    """A studio for `board_frames`, without calibration error (``rig`` itself photographs), motion, and further bounces,
-    which a flat board has not. Raises `CalibrationError` for a board that can't be printed, and what the
-    builder raises for rig, light and seed."""
+    """A studio for `board_frames`, without calibration error (``rig`` itself photographs), motion,
+    and further bounces, which a flat board has not. Raises `CalibrationError` for a board that
+    can't be printed, and what the builder raises for rig, light and seed."""
     check_print(board)
     light = (light or named_light("paper")).changed(motion_mm=0.0, calibration_px=0.0)
     light = light.changed("bounces", interreflection=False, ambient_occlusion=False)
-    return Studio(BuildSettings(rig, ("mug",), light=light, seed=seed))  # of no object, but settings name one
+    return Studio(
+        BuildSettings(rig, ("mug",), light=light, seed=seed)
+    )  # of no object, but settings name one
 
 
-def board_frames(studio: Studio, board: Board, pose: BoardPose, name: str) -> list[NDArray[np.uint8]]:
-    """All frames of a pose, uint8 (H, W) each, in the order of the rig's sequence; ``name`` names the noise. They are
-    views of memory that the next pose overwrites."""
+def board_frames(
+    studio: Studio, board: Board, pose: BoardPose, name: str
+) -> list[NDArray[np.uint8]]:
+    """All frames of a pose, uint8 (H, W) each, in the order of the rig's sequence; ``name`` names
+    the noise. They are views of memory that the next pose overwrites."""
     frames = tuple(range(len(studio.rig.sequence)))
     studio.expose(board_view(studio, board, pose, (studio.settings.seed, "board", name)), frames)
     return [studio.frame(index) for index in frames]
@@ -51,21 +56,24 @@ def photograph_board(
     seed: int = 42,
     progress: Callable[[int], None] = lambda images: None,
 ) -> list[Path]:
-    """Photograph ``board`` with ``rig`` in ``poses`` (by default `board_poses`) under ``light`` (by default `paper`),
-    and return the poses' folders::
+    """Photograph ``board`` with ``rig`` in ``poses`` (by default `board_poses`) under ``light`` (by
+    default `paper`), and return the poses' folders::
 
         FOLDER/pose_00/frame_00.png ...     8-bit grey, in the order of the rig's sequence
         FOLDER/board.yaml                   the board, as `parse_board` takes it; its true poses, light and seed
         FOLDER/rig.yaml                     the rig that took them: the truth for a calibration
 
-    Images have the same grey levels on every processor. An interrupted run is continued: poses that are there are left
-    as they are. ``progress`` is called with numbers of finished images. Raises `CaptureError` for a folder with other
-    captures or files, or one that can't be written, `BuildError` for one in use by another process, `CalibrationError`
-    for a board that does not fit, and what the builder raises for rig, light and seed."""
+    Images have the same grey levels on every processor. An interrupted run is continued: poses that
+    are there are left as they are. ``progress`` is called with numbers of finished images. Raises
+    `CaptureError` for a folder with other captures or files, or one that can't be written,
+    `BuildError` for one in use by another process, `CalibrationError` for a board that does not
+    fit, and what the builder raises for rig, light and seed."""
     place = Path(folder)
     studio = board_studio(rig, board, light, seed)
     poses = board_poses(rig, board) if poses is None else tuple(poses)
-    described = yaml.safe_dump(_description(board, poses, studio), sort_keys=False, default_flow_style=None, width=120)
+    described = yaml.safe_dump(
+        _description(board, poses, studio), sort_keys=False, default_flow_style=None, width=120
+    )
     names = [f"pose_{index:02d}" for index in range(len(poses))]
     if place.exists() and not place.is_dir():
         raise CaptureError(f"{place}: is a file; give a folder")
@@ -80,7 +88,8 @@ def photograph_board(
                 progress(len(rig.sequence))
     except OSError as error:
         raise CaptureError(
-            f"{place}: writing failed ({error.strerror or error}); remove the cause, then run the same command again: "
+            f"{place}: writing failed ({error.strerror or error}); remove the cause, then run the "
+            f"same command again: "
             "it resumes"
         ) from error
     return [place / name for name in names]
@@ -94,22 +103,32 @@ def _description(board: Board, poses: Sequence[BoardPose], studio: Studio) -> di
         "light": studio.light.model_dump(mode="json"),
         "seed": studio.settings.seed,
         "poses": [
-            {"rotation": [list(row) for row in pose.rotation], "translation_m": list(pose.translation_m)}
+            {
+                "rotation": [list(row) for row in pose.rotation],
+                "translation_m": list(pose.translation_m),
+            }
             for pose in poses
         ],
     }
 
 
 def _check_folder(place: Path, described: str, rig: Rig) -> None:
-    """Raise `CaptureError` unless the folder is empty or an earlier run of the same captures left it."""
+    """Raise `CaptureError` unless the folder is empty or an earlier run of the same captures left
+    it."""
     others = sorted(path.name for path in place.iterdir() if path.name != LOCK_FILE)
     board_file, rig_file = place / BOARD_FILE, place / RIG_FILE
     if not board_file.is_file():
         if others:
-            raise CaptureError(f"{place}: holds other files ({others[0]}), no {BOARD_FILE}; give a new or empty folder")
-    elif board_file.read_bytes() != described.encode() or (rig_file.is_file() and load_rig(rig_file) != rig):
+            raise CaptureError(
+                f"{place}: holds other files ({others[0]}), no {BOARD_FILE}; give a new or empty "
+                f"folder"
+            )
+    elif board_file.read_bytes() != described.encode() or (
+        rig_file.is_file() and load_rig(rig_file) != rig
+    ):
         raise CaptureError(
-            f"{place}: holds captures of another board, rig, light, seed or poses; give a new folder, or the same "
+            f"{place}: holds captures of another board, rig, light, seed or poses; give a new "
+            f"folder, or the same "
             "settings to continue there"
         )
 

@@ -1,7 +1,7 @@
 """Where a calibration board stands: poses spread over the range, the image, and directions of tilt.
 
-A pose takes points of the board (x to the right, y down, z away from the viewer, the first point at 0) to the camera's
-frame. Poses are computed with the same bits on every processor.
+A pose takes points of the board (x to the right, y down, z away from the viewer, the first point at
+0) to the camera's frame. Poses are computed with the same bits on every processor.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from fpp_ml_bench.portable import cosine_of_turns, matrix_product, sine_of_turns
 BOARD_POSES = 18
 """As many as the paper takes (Section 2.3)."""
 PAPER_BOARD = Board("circles-asymmetric", 5, 9, 20.0, 5.0)
-"""The paper's (Section 2.3): 5 x 9 asymmetric circles of 10 mm, 20 mm apart. Its sheet takes 7% of the image at the
-standoff."""
+"""The paper's (Section 2.3): 5 x 9 asymmetric circles of 10 mm, 20 mm apart. Its sheet takes 7% of
+the image at the standoff."""
 MARGIN = {"checker": 1.5, "circles": 0.75, "circles-asymmetric": 0.75, "charuco": 1.5}
 """From the outer points to the end of the sheet, in spacings."""
 COVERED = 0.65
@@ -35,7 +35,8 @@ _PLACES = ((0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, 0),
 
 @dataclass(frozen=True)
 class BoardPose:
-    """``rotation`` (three rows) and ``translation_m``: X_camera = rotation X_board + translation_m."""
+    """``rotation`` (three rows) and ``translation_m``: X_camera = rotation X_board +
+    translation_m."""
 
     rotation: tuple[tuple[float, float, float], ...]
     translation_m: tuple[float, float, float]
@@ -44,7 +45,9 @@ class BoardPose:
         """Points (n, 3) of the board in the camera's frame, metres."""
         x, y, z = points_m.T
         rows = zip(self.rotation, self.translation_m, strict=True)
-        return np.column_stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows])
+        return np.column_stack(
+            [row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows]
+        )
 
 
 def sheet_corners_mm(board: Board) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -56,8 +59,8 @@ def sheet_corners_mm(board: Board) -> tuple[tuple[float, float], tuple[float, fl
 
 
 def fitting_board(rig: Rig, kind: str = "circles", columns: int = 5, rows: int = 9) -> Board:
-    """A board for a rig: its longer side takes `COVERED` of the image's shorter side at the standoff, the spacing a
-    round number of mm. Circles have a radius of 0.3 spacings."""
+    """A board for a rig: its longer side takes `COVERED` of the image's shorter side at the
+    standoff, the spacing a round number of mm. Circles have a radius of 0.3 spacings."""
     unit = Board(kind, columns, rows, 1.0, 0.3 if kind.startswith("circles") else 0.0)
     (left, top), (right, bottom) = sheet_corners_mm(unit)
     camera = rig.camera
@@ -69,12 +72,15 @@ def fitting_board(rig: Rig, kind: str = "circles", columns: int = 5, rows: int =
 
 
 def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES) -> tuple[BoardPose, ...]:
-    """``count`` poses at which the sheet is within the working range, the image and the pattern: towards the middle,
-    the corners and the sides of the image in turn, tilted by up to `MOST_TILT` in directions all round, upright and
-    turned by a quarter, at distances over the whole range. Raises `CalibrationError` for a board that does not fit."""
+    """``count`` poses at which the sheet is within the working range, the image and the pattern:
+    towards the middle, the corners and the sides of the image in turn, tilted by up to `MOST_TILT`
+    in directions all round, upright and turned by a quarter, at distances over the whole range.
+    Raises `CalibrationError` for a board that does not fit."""
     if count < 1:
         raise CalibrationError(f"expected 1 or more poses, got {count}")
-    (left, top), (right, bottom) = (np.array(corner) / MM_PER_M for corner in sheet_corners_mm(board))
+    (left, top), (right, bottom) = (
+        np.array(corner) / MM_PER_M for corner in sheet_corners_mm(board)
+    )
     corners = np.array([[x, y, 0.0] for y in (top, bottom) for x in (left, right)])
     centre = np.array([(left + right) / 2, (top + bottom) / 2, 0.0])
     middle, reach = _seen_by_both(rig)
@@ -82,7 +88,9 @@ def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES) -> tuple[Board
     for index in range(count):
         share = 1.0 if count == 1 else LEAST_TILT + (1 - LEAST_TILT) * (index * PLASTIC % 1.0)
         roll = 0.25 * (index % 2) + 0.03 * (index % 3 - 1)
-        tilt, rolled = (np.array(rows) for rows in (_tilt(MOST_TILT * share, index * GOLDEN % 1.0), _roll(roll)))
+        tilt, rolled = (
+            np.array(rows) for rows in (_tilt(MOST_TILT * share, index * GOLDEN % 1.0), _roll(roll))
+        )
         first, second, third = (tuple(row) for row in matrix_product(tilt, rolled).tolist())
         rotation = first, second, third
         place = np.array(_PLACES[index % len(_PLACES)]) * reach
@@ -91,22 +99,33 @@ def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES) -> tuple[Board
         if pose is None:
             size = f"{MM_PER_M * (right - left):g} x {MM_PER_M * (bottom - top):g} mm"
             raise CalibrationError(
-                f"board {board}: its sheet of {size} does not fit the working range, the image and the pattern in pose "
-                f"{index}; {fitting_board(rig, board.kind, board.columns, board.rows)} would suit this rig"
+                f"board {board}: its sheet of {size} does not fit the working range, the image and "
+                f"the pattern in pose "
+                f"{index}; {fitting_board(rig, board.kind, board.columns, board.rows)} would suit "
+                f"this rig"
             )
         poses.append(pose)
     return tuple(poses)
 
 
 def _fitting_pose(
-    rig: Rig, rotation: tuple, about: NDArray, centre: NDArray, middle: NDArray, place: NDArray, distance_share: float
+    rig: Rig,
+    rotation: tuple,
+    about: NDArray,
+    centre: NDArray,
+    middle: NDArray,
+    place: NDArray,
+    distance_share: float,
 ) -> BoardPose | None:
-    """The pose farthest towards ``place`` (px from ``middle``) at the distance nearest to the share of the range."""
+    """The pose farthest towards ``place`` (px from ``middle``) at the distance nearest to the share
+    of the range."""
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
     near_m, far_m = near_m - float(about[:, 2].min()), far_m - float(about[:, 2].max())
     if near_m > far_m:
         return None
-    shares = sorted((step / _STEPS for step in range(_STEPS + 1)), key=lambda share: abs(share - distance_share))
+    shares = sorted(
+        (step / _STEPS for step in range(_STEPS + 1)), key=lambda share: abs(share - distance_share)
+    )
     for depth_m in (near_m + (far_m - near_m) * share for share in (distance_share, *shares)):
         for step in range(_STEPS, -1, -1):
             pixel = middle + place * (step / _STEPS)
@@ -120,7 +139,10 @@ def _fitting_pose(
 
 def _visible(rig: Rig, points_m: NDArray[np.float64]) -> bool:
     """Whether the image and the pattern hold all points (n, 3), with a margin."""
-    for device, (u, v) in ((rig.camera, rig.camera.project(points_m)), (rig.projector, rig.project(points_m))):
+    for device, (u, v) in (
+        (rig.camera, rig.camera.project(points_m)),
+        (rig.projector, rig.project(points_m)),
+    ):
         inside = (u >= _MARGIN_PX) & (u <= device.width - 1 - _MARGIN_PX)
         inside &= (v >= _MARGIN_PX) & (v <= device.height - 1 - _MARGIN_PX)
         if not inside.all():
@@ -129,15 +151,19 @@ def _visible(rig: Rig, points_m: NDArray[np.float64]) -> bool:
 
 
 def _seen_by_both(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Middle of the image's part that the projector lights at the standoff, and half of its size, (2,) px each."""
+    """Middle of the image's part that the projector lights at the standoff, and half of its size,
+    (2,) px each."""
     camera, projector = rig.camera, rig.projector
-    column, row = (axis.ravel() for axis in np.meshgrid(np.arange(camera.width), np.arange(camera.height)))
+    column, row = (
+        axis.ravel() for axis in np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    )
     x, y = (axis.ravel() for axis in camera.rays())
     u, v = rig.project(along_rays(x, y, rig.standoff_m))
     lit = (u >= 0) & (u <= projector.width - 1) & (v >= 0) & (v <= projector.height - 1)
     if not lit.any():
         raise CalibrationError(
-            f"the projector lights nothing that the camera sees at the standoff of {rig.standoff_m:g} m; check the rig"
+            f"the projector lights nothing that the camera sees at the standoff of "
+            f"{rig.standoff_m:g} m; check the rig"
         )
     low, high = (np.array([f(column[lit]), f(row[lit])], dtype=float) for f in (np.min, np.max))
     return (low + high) / 2, (high - low) / 2
