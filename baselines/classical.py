@@ -135,10 +135,8 @@ class ClassicalMethod(Method):
         if not submission.name.startswith("Classical "):
             return None
         settings = submission.settings
-        steps, direction = (
-            index(settings["steps"]),
-            DIRECTIONS[DIRECTIONS.index(settings["direction"])],
-        )  # type: ignore[arg-type]
+        steps = index(settings["steps"])  # type: ignore[arg-type]
+        direction = DIRECTIONS[DIRECTIONS.index(settings["direction"])]  # type: ignore[arg-type]
         if not settings.get("fewest"):
             return f"Classical {steps}+Gray, {direction}"
         gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)

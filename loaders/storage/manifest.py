@@ -226,20 +226,21 @@ def strictly(kind: type[Kind], value: Any, where: str = "") -> Kind:
                 f"{printable(where).strip() or 'the file'}: expected exactly the keys "
                 f"{', '.join(types)}"
             )
-        built = kind(
-            **{name: strictly(types[name], value[name], f"{where} {name}") for name in types}
-        )  # type: ignore[arg-type]
+        parts = {
+            name: strictly(types[name], value[name], f"{where} {name}")  # type: ignore[arg-type]
+            for name in types
+        }
+        built = kind(**parts)
         if isinstance(built, ShardFile | OtherFile):
             _check_file(built)
         return built  # type: ignore[return-value]
     of, inner = get_origin(kind), get_args(kind)
     if of is dict and isinstance(value, dict):
         plain = inner[1] is Any  # and so are the keys of what was JSON
-        return (
-            value
-            if plain
-            else {key: strictly(inner[1], value[key], f"{where} {key}") for key in value}
-        )  # type: ignore[return-value]
+        if plain:
+            return value  # type: ignore[return-value]
+        found = {key: strictly(inner[1], value[key], f"{where} {key}") for key in value}
+        return found  # type: ignore[return-value]
     if of in (list, tuple) and isinstance(value, list) and (of is list or len(value) == len(inner)):
         return of(strictly(inner[0], entry, where) for entry in value)  # type: ignore[no-any-return]
     if kind is Any or type(value) is kind:
