@@ -273,6 +273,22 @@ def test_damaged_textures_are_refused_in_words(tmp_path, damage, says):
     assert str(path) in str(caught.value)
 
 
+def test_a_damaged_image_inside_a_glb_is_refused(tmp_path):
+    trimesh.load(write_quad(tmp_path, two_colours()), force="mesh", process=False).export(
+        tmp_path / "quad.glb"
+    )
+    content = bytearray((tmp_path / "quad.glb").read_bytes())
+    length = struct.unpack_from("<I", content, 12)[0]
+    header = json.loads(content[20 : 20 + length])
+    start = (
+        28 + length + header["bufferViews"][header["images"][0]["bufferView"]].get("byteOffset", 0)
+    )
+    content[start : start + 8] = bytes(8)
+    (tmp_path / "quad.glb").write_bytes(content)
+    with pytest.raises(MeshError, match="can't be read"):
+        load_user_mesh(UserMesh("quad", str(tmp_path / "quad.glb")))
+
+
 @pytest.mark.parametrize("suffixes", [("obj", "mtl", "png"), ("glb",)], ids=["obj", "glb"])
 def test_changed_bytes_give_a_mesh_or_words(tmp_path, suffixes):
     loaded = trimesh.load(write_quad(tmp_path, two_colours(16)), force="mesh", process=False)
