@@ -30,7 +30,7 @@ from fpp_ml_bench.baselines.phase.geometry import (
     wrapped,
 )
 from fpp_ml_bench.baselines.phase.local_fit import fringes, phase_slopes
-from fpp_ml_bench.baselines.phase.observe import Observation, OneCarrier
+from fpp_ml_bench.baselines.phase.observe import SLOPE_PERIODS, Observation, OneCarrier
 from fpp_ml_bench.baselines.phase.order import LEAST_BRIGHTNESS
 
 STEPS = (-1, 0, 1)
@@ -113,7 +113,6 @@ CROSSED_CHANNELS = (
     "first guess",
     *SIDE_CHANNELS,
 )
-SLOPE_PERIODS = 0.13  # sigma over which slopes are averaged
 LEAST_BRIGHT = 0.05  # least brightness that is divided by, as a multiple of the object's median
 
 
