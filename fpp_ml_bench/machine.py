@@ -2,7 +2,6 @@
 Imports neither NumPy nor torch."""
 
 import ctypes
-import gc
 import os
 import platform
 import re
@@ -118,11 +117,8 @@ def keep_freed_memory() -> None:
 
 
 def prepare_process() -> None:
-    """Keep freed memory, look for no pydantic plugins (a search of every installed package), and
-    collect no cyclic garbage: the collector visits every imported object again and again, and
-    scoring leaves no reference cycles."""
+    """Keep freed memory, and look for no pydantic plugins (a search of every installed package)."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    gc.disable()
     keep_freed_memory()
 
 

@@ -2,7 +2,7 @@
 shown."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from fpp_ml_bench.baselines.method import Assumption
@@ -68,13 +68,14 @@ _DEVICE_WIDTH, _LONGEST_NAME = 40, 90
 class Column:
     """``text`` makes the cell; ``right``: aligned to the right, as numbers are. Where a terminal is
     too narrow, columns of the largest ``from_width`` are left out first. A table has it where
-    ``present`` holds of any row."""
+    ``present`` holds of any row. ``key``: the score that it shows."""
 
     title: str
     text: Callable[[Ranked], str]
     right: bool = True
     from_width: int = 0
     present: Callable[[Ranked], bool] = lambda row: True
+    key: str = ""
 
     def shown_for(self, rows: Sequence[Ranked]) -> bool:
         """Whether a table of ``rows`` has it."""
@@ -91,11 +92,8 @@ def columns(sort: str) -> list[Column]:
     errors = []
     for key, title in shown.items():
         of_key, width = partial(error, key), 0 if key == sort else METRICS[key].column_from
-        errors.append(
-            _sparse(title, of_key, width)
-            if METRICS[key].charged
-            else Column(title, of_key, True, width)
-        )
+        column = _sparse(title, of_key, width) if METRICS[key].charged else Column(title, of_key)
+        errors.append(replace(column, from_width=width, key=key))
         if key == sort and key in RANKED:
             ends = partial(interval, between="-", key=sort)
             errors.append(Column("95% interval", ends, from_width=MIDDLE))

@@ -241,9 +241,8 @@ def _two_lines(title: str) -> str:
 def _importance(sort: str, column: Column) -> tuple[bool, int, int]:
     """Sort key of the columns: those of a low importance are left out first. What rows are sorted
     by stays longest."""
-    is_sorted_by = getattr(column.text, "args", None) == (sort,)
     return (
-        is_sorted_by,
+        column.key == sort,
         -column.from_width,
         LAST_OUT.index(column.title) if column.title in LAST_OUT else -1,
     )

@@ -19,6 +19,8 @@ from packaging.utils import canonicalize_name
 
 from fpp_ml_bench.cli import COMMANDS, EVAL, EXTRAS
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parent.parent
 SUBPACKAGES = ("loaders", "evaluation", "baselines", "leaderboard")
 

@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -39,14 +39,11 @@ from fpp_ml_bench.evaluation.result.parts import (
     Sparsification,
     Uncertainty,
 )
-from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, SigmaSample, combine
+from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, Scored, SigmaSample, combine
 from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.loaders.storage.benchmark import Counts, known_problem
 from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.score.evaluator import Scored
 
 Scores = dict[str, float | None]
 
@@ -162,7 +159,7 @@ class Result(SparseModel, _Scores, _Rules):
         return self
 
 
-def scores_of(scored: "Sequence[Scored]") -> dict[str, Any]:
+def scores_of(scored: Sequence[Scored]) -> dict[str, Any]:
     """Every key of `ArrayScores` from ``scored`` samples, of which all state an uncertainty or none
     does."""
     per_sample = [

@@ -6,11 +6,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +28,12 @@ from fpp_ml_bench.depth import (
     shape_problem,
     without_nodata,
 )
-from fpp_ml_bench.depth_readings import MOST_GLANCES, Glance, another_reading, glance
+from fpp_ml_bench.depth_readings import MOST_GLANCES, another_reading, glance
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.result.file import environment
+from fpp_ml_bench.evaluation.result.model import ArrayScores, Result, scores_of
 from fpp_ml_bench.evaluation.score.check import (
     Rules,
     checked_description,
@@ -43,6 +44,7 @@ from fpp_ml_bench.evaluation.score.check import (
 )
 from fpp_ml_bench.evaluation.score.sample_scores import (
     SampleScores,
+    Scored,
     SigmaSample,
     score_sample,
     score_sigma,
@@ -62,9 +64,6 @@ from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, skipping
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.result.model import ArrayScores, Result
-
 Maps = NDArray[Any] | Sequence[NDArray[Any]]
 WORKERS = 4
 
@@ -76,7 +75,6 @@ def evaluate(
     target: str = "depth",
     edge_band_px: int = protocol.EDGE_BAND_PX,
     mode: str = "standard",
-    while_scoring: Callable[[], object] = lambda: None,
     say: Callable[[str], object] = lambda note: None,
 ) -> Result:
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a
@@ -85,9 +83,8 @@ def evaluate(
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast);
     ``mode`` is ``standard`` or ``paper`` (the paper's pixel sets, without void, and its rule for
     normalised depth). Memory does not grow with the number of samples, and the result does not
-    depend on the number of cores. ``while_scoring`` is called once while threads score: a command
-    uses it to import what it needs afterwards. ``say`` is given a note where another reading of the
-    predictions fits far better (`another_reading`).
+    depend on the number of cores. ``say`` is given a note where another reading of the predictions
+    fits far better (`another_reading`).
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem)
     for the predictions, and DatasetError for a target that is not a depth map, and for other data
@@ -100,9 +97,7 @@ def evaluate(
     except SubmissionError as error:
         refusal = error
     listing = list_folder(folder, dataset, split)
-    # What is no number is refused with the description, which is checked while the first files are
-    # scored, for pydantic takes long to import: `result` and `submission` are packages that load
-    # what is used of them.
+    # What is no number is refused with the description, which is checked while threads score.
     level, rule = (
         content.get("png_mm_per_level"),
         "valid" if content.get("range_rule") == "valid" else "object",
@@ -121,9 +116,6 @@ def evaluate(
             description = checked_description(folder, content, listing.form, dataset)
         except SubmissionError as error:
             refusal = error
-        import fpp_ml_bench.evaluation.result.model  # noqa: F401  pydantic takes long: while the threads score
-
-        while_scoring()
     problems, scored = list(listing.problems), []
     for outcome in outcomes:
         if isinstance(outcome, Scored):
@@ -140,9 +132,6 @@ def evaluate(
         "the predictions", [sample.seen for sample in scored if sample.seen is not None]
     ):
         say(note)
-    from fpp_ml_bench.evaluation.result.file import environment
-    from fpp_ml_bench.evaluation.result.model import Result, scores_of
-
     hashes: dict[tuple[str, str], dict[str, str]] = {}
     for sample in scored:
         for column, digest in sample.hashes.items():
@@ -176,20 +165,6 @@ def evaluate(
         "environment": environment(),
     }
     return Result(**about, **scores_of(scored))
-
-
-@dataclass(frozen=True)
-class Scored:
-    """A scored sample of an object: its ``row`` (the other keys of `SampleResult`), the scores of
-    its stated uncertainty, None without, the hashes of what it was scored against by column, and of
-    some samples a glance."""
-
-    name: str
-    object: str
-    row: dict[str, Any]
-    stated: SigmaSample | None
-    hashes: dict[str, str]
-    seen: Glance | None = None
 
 
 def _row(scores: SampleScores, digest: str) -> dict[str, Any]:
@@ -370,8 +345,6 @@ def evaluate_arrays(
             raise PredictionError(f"sample {number}: {error}") from None
         row = _row(scores, hashlib.sha256(np.ascontiguousarray(prediction).data).hexdigest())
         scored.append(Scored(f"sample {number}", names[number], row, stated, {}))
-    from fpp_ml_bench.evaluation.result.model import ArrayScores, scores_of
-
     return ArrayScores(**scores_of(scored))
 
 

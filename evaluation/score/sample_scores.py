@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import edge_jump_mm, object_box, object_mask, object_near_edges
+from fpp_ml_bench.depth_readings import Glance
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY
@@ -466,6 +467,20 @@ class SigmaSample:
         return mean_of(
             np.maximum(np.array(self.curves[error]) - np.array(self.curves[f"best_{error}"]), 0.0)
         )
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A scored sample of an object: its ``row`` (the other keys of `SampleResult`), the scores of
+    its stated uncertainty, None without, the hashes of what it was scored against by column, and of
+    some samples a glance."""
+
+    name: str
+    object: str
+    row: dict[str, Any]
+    stated: SigmaSample | None
+    hashes: dict[str, str]
+    seen: Glance | None = None
 
 
 @cache

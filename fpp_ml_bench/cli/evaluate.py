@@ -2,10 +2,9 @@
 results."""
 
 import sys
-from collections.abc import Callable
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.options import SPLITS, Explain, command, new_file, new_folder, value
@@ -16,7 +15,6 @@ from fpp_ml_bench.machine import prepare_process
 from fpp_ml_bench.options import argument, option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.result.model import Result
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 LISTED = 20
@@ -96,16 +94,7 @@ def score_folder(
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
     notes: list[str] = []
-    scored = evaluate_folder(
-        predictions,
-        opened,
-        split,
-        target,
-        edge_band,
-        mode,
-        while_scoring=_result_table,
-        say=notes.append,
-    )
+    scored = evaluate_folder(predictions, opened, split, target, edge_band, mode, say=notes.append)
     if json is not None:
         write_result(scored, json)
     if page is not None:
@@ -113,8 +102,9 @@ def score_folder(
 
         write_report(scored, opened, predictions, page)
     from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
+    from fpp_ml_bench.evaluation.report.terminal import result_table
 
-    show(_result_table()(scored))  # when all is written: printing ends where nobody reads any more
+    show(result_table(scored))  # when all is written: printing ends where nobody reads any more
     for written in (json, page):
         if written is not None:
             print(f"Written: {written}")
@@ -124,13 +114,6 @@ def score_folder(
     for note in notes:
         print(f"fpp-eval: note: {note}", file=sys.stderr)
     account.say(lambda: explain_eval(opened, split, target))
-
-
-def _result_table() -> "Callable[[Result], Any]":
-    """`report.terminal.result_table`, which imports rich."""
-    from fpp_ml_bench.evaluation.report.terminal import result_table
-
-    return result_table
 
 
 def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[DatasetFolder, str]":

@@ -232,13 +232,10 @@ class Studio:
             return shadow_rays
         # An object that moves leaves pixels of the first frame, where all are decoded.
         everything = not skipping_enabled() or self.light.motion_mm > 0
-        whole = tuple(frame for frame in frames if everything or frame not in self.unstored)
-        for run in (
-            np.split(whole, np.flatnonzero(np.diff(whole) > 1) + 1) if whole else ()
-        ):  # runs of neighbours
-            exposure.expose(
-                run.tolist(), behind, self._pixels, scene.stream, images[run[0] : run[-1] + 1]
-            )
+        whole = [frame for frame in frames if everything or frame not in self.unstored]
+        for frame in whole:
+            out = images[frame : frame + 1]
+            exposure.expose((frame,), behind, self._pixels, scene.stream, out)
         for pixels, lit in parts:
             exposed = exposure.expose(frames, lit, pixels.astype(np.uint32), scene.stream)
             for index, values in zip(frames, exposed, strict=True):

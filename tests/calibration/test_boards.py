@@ -111,6 +111,7 @@ def test_markers_may_lie_as_before_opencv_4_6(rows, before_4_6):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "text, change, seen",
     [

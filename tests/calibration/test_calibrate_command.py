@@ -13,6 +13,8 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
 from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
+pytestmark = pytest.mark.long
+
 SIZE = 240
 
 

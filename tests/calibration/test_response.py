@@ -12,6 +12,8 @@ from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("gamma", [1.0, 1.6])
 def test_gamma_is_that_of_the_light(tmp_path, gamma):

@@ -19,6 +19,8 @@ from fpp_ml_bench.constants import PRESETS
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.named_rigs import paper_rig
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = {"fpp-bench": main, "fpp-eval": main_eval}
 

@@ -11,6 +11,8 @@ from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import main_eval as evaluate
 
+pytestmark = pytest.mark.long
+
 README = Path(__file__).resolve().parents[2] / "README.md"
 
 

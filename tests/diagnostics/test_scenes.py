@@ -64,6 +64,7 @@ WORN = (
 their dataset."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("light", [named_light("paper"), WORN], ids=["paper", "hard"])
 def test_an_unchanged_scene_is_the_datasets_own(light, tmp_path):
     """Of a dataset in direct light, one ray a pixel: bounces and mixed pixels need the mesh, which

@@ -57,6 +57,7 @@ def photographed(rig, light, name="mug", view="A60", **changes):
     return np.stack([row.frames[index] for index in range(len(rig.sequence))])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("light", ["paper", "workshop", "hard"])
 @pytest.mark.parametrize(
     "sequence",

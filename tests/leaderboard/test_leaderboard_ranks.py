@@ -294,6 +294,8 @@ def tables():
     yield np.round(rng.uniform(1, 2, (10, 7)), 1)
 
 
+@pytest.mark.long
+@pytest.mark.long
 def test_who_is_behind_whom_is_what_the_listed_pairs_say():
     """Bounds of p values leave out most tests, and change no verdict."""
     told_apart = 0

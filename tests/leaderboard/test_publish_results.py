@@ -19,6 +19,8 @@ from fpp_ml_bench.leaderboard.publish import hub_score
 from fpp_ml_bench.loaders.hub import Publication, Remote, changes, check_repo_name
 from fpp_ml_bench.loaders.storage.parquet import preview
 
+pytestmark = pytest.mark.long
+
 HOSTILE = "</script>: [*x]({y}) | `z` - !!python/object:os.system"
 
 

@@ -22,6 +22,8 @@ from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
 from fpp_ml_bench.loaders.render.scene import preset_settings
 
+pytestmark = pytest.mark.long
+
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
 
 

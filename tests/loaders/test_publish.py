@@ -20,6 +20,8 @@ from scored_dataset import make_dataset
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.sample import config_columns
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory):

@@ -23,6 +23,8 @@ from fpp_ml_bench.leaderboard.ranking import (
 )
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 
+pytestmark = pytest.mark.long
+
 HOSTILE = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'>"
 
 

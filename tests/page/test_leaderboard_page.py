@@ -35,6 +35,8 @@ from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.style import escaped, page
 
+pytestmark = pytest.mark.long
+
 
 class Parsed(HTMLParser):
     """Elements with their attributes, and the visible text."""

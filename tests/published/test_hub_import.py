@@ -31,6 +31,8 @@ from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.published.exporting import export
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
+pytestmark = pytest.mark.long
+
 RAW = f"{TRAINING}/{FOLDERS['raw']}"
 MAT = f"{RAW}/test/depth/power_drill_A60.mat"
 

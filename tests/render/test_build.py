@@ -33,6 +33,8 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
+pytestmark = pytest.mark.long
+
 PAPER = named_light("paper")
 NOISY = PAPER.changed("camera", **camera_noise(2.0))
 

@@ -25,6 +25,8 @@ from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.pictures import panel_figure
 from fpp_ml_bench.style import figure_png
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def scored(dataset, tmp_path_factory):

@@ -40,6 +40,8 @@ from fpp_ml_bench.leaderboard.ranking import rank
 from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
+pytestmark = pytest.mark.long
+
 TABLE = "normalization"
 NAMES = ("small-unet-raw-rmse", "small-unet-global-rmse", "small-unet-individual-rmse")
 SEEDED = [f"{name}-seed_{seed}" for name in NAMES for seed in (1, 2)]

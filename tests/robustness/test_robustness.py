@@ -30,6 +30,8 @@ from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.schema import validate
 
+pytestmark = pytest.mark.long
+
 SIZE, OBJECT = 176, "v_groove"
 ONE_FRAME = (0,)
 RULES = corruptions()

@@ -23,6 +23,8 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DecodeError, StabilityError
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
 
+pytestmark = pytest.mark.long
+
 
 def cases_of(group, *families):
     cases = [case for case in all_cases([group]) if case.family in families]

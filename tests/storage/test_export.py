@@ -21,6 +21,8 @@ from fpp_ml_bench.loaders.published.order import FrameOrder, parse_order
 from fpp_ml_bench.loaders.sample import config_columns
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
+pytestmark = pytest.mark.long
+
 TRAINING = Path("training_datasets")
 SCANS = Path("fpp_synthetic_dataset")
 NAMES = {"train": "train", "validation": "val", "test": "test"}

@@ -36,6 +36,8 @@ from fpp_ml_bench.files import exclusive
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import Rig
 
+pytestmark = pytest.mark.long
+
 OWN_METHOD = """
 import numpy as np
 from fpp_ml_bench.baselines.method import Method
