@@ -9,6 +9,7 @@ the variances that the members state and the variance between their phases (Laks
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -18,12 +19,13 @@ from fpp_ml_bench.baselines.learned.inputs import CroppedMaps, Geometry
 from fpp_ml_bench.baselines.learned.network import FringeNet
 from fpp_ml_bench.baselines.learned.odds import SCALE_TO_SIGMA
 from fpp_ml_bench.baselines.learned.routes import EXPECTED_SHARE
+from fpp_ml_bench.baselines.learned.warp import Warp
 from fpp_ml_bench.baselines.phase.depth import Fitted, NearnessFit
-from fpp_ml_bench.baselines.phase.geometry import TAU, Crop, Image, wrapped
+from fpp_ml_bench.baselines.phase.geometry import Carriers, Crop, Image, wrapped
 from fpp_ml_bench.baselines.phase.local_fit import fringes
 from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Observation
 from fpp_ml_bench.baselines.phase.order import FringeOrder
-from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, TAU
 
 WINDOW_PERIODS = 0.6
 """Sigma of the Gaussian over which mean and spread of the grey levels are taken."""
@@ -88,20 +90,47 @@ def phases_of(networks: Sequence[FringeNet], x: Image) -> Phases:
     return Phases(phase.astype(np.float32), np.sqrt(variance).astype(np.float32))
 
 
+def warped_phases(
+    networks: Sequence[FringeNet], grey: Image, period_px: float, warp: Warp
+) -> Phases:
+    """Phases at the pixels of an image ``grey`` (h, w), which ``warp`` takes to the fringes of
+    ``period_px``, the longer one of two, that the networks learned from."""
+    image = warp.image(grey)
+    scene = FringeScene.of(image, period_px, (slice(0, image.shape[0]), slice(0, image.shape[1])))
+    found = phases_of(networks, fringe_channels(scene))
+    phase_rad, *sigmas = warp.back(found.phase_rad, [*found.sigma_rad], grey.shape)
+    return Phases(phase_rad, np.stack(sigmas))
+
+
 @dataclass(frozen=True)
 class FringePhase:
     """The phase of fringes of one direction by networks, for which they are turned so that phase
-    grows downwards. The order is that of the local fit: with the exact phase larger parts hang
-    together, and all of a part is wrong where a texture misleads it."""
+    grows downwards, and brought to the period of ``learned_px``. The order is that of the local
+    fit: with the exact phase larger parts hang together, and all of a part is wrong where a texture
+    misleads it."""
 
     geometry: Geometry
     networks: Sequence[FringeNet]
+    learned_px: float
+
+    @cached_property
+    def warp(self) -> Warp:
+        """From the turned image."""
+        rotation, model = self.geometry.rotation, self.geometry.model
+        phase = model.layer.absolute_phase(model.rig.standoff_m * MM_PER_M)
+        turned = rotation.sign * rotation.turn(phase)
+        step_rad = [np.diff(turned, axis=axis).mean() for axis in (1, 0)]
+        return Warp.of_one(np.array(step_rad), self.learned_px)
 
     def phases(self, seen: Observation) -> Phases:
         """Of the one carrier."""
-        rotation = self.geometry.rotation
-        x = fringe_channels(FringeScene.of(seen.greys[0], self.geometry.period_px, seen.crop))
-        turned = phases_of(self.networks, np.ascontiguousarray(rotation.turn(x)))
+        rotation, grey = self.geometry.rotation, seen.greys[0]
+        if self.warp.needed:
+            grey = np.ascontiguousarray(rotation.turn(grey))
+            turned = warped_phases(self.networks, grey, self.learned_px, self.warp)
+        else:
+            x = fringe_channels(FringeScene.of(grey, self.geometry.period_px, seen.crop))
+            turned = phases_of(self.networks, np.ascontiguousarray(rotation.turn(x)))
         phase, sigma = (
             np.ascontiguousarray(rotation.back(maps))
             for maps in (turned.phase_rad, turned.sigma_rad)
@@ -122,18 +151,25 @@ class FringePhase:
 
 @dataclass(frozen=True)
 class CrossedPhases:
-    """The phases of both carriers of one crossed frame by networks, of the rig that they learned
-    from: first for the choice of the order (`before`), then for the nearness of every pixel
-    (`after`)."""
+    """The phases of both carriers of one crossed frame by networks: first for the choice of the
+    order (`before`), then for the nearness of every pixel (`after`). ``carriers``: those of the
+    image; ``learned``: of the networks'."""
 
-    period_px: float
+    carriers: Carriers
+    learned: Carriers
     networks: Sequence[FringeNet]
+
+    @cached_property
+    def warp(self) -> Warp:
+        """From the image to the networks'."""
+        return Warp.of_pair(self.carriers, self.learned)
 
     def phases(self, seen: CrossedObservation) -> Phases:
         """Of both carriers."""
-        return phases_of(
-            self.networks, fringe_channels(FringeScene.of(seen.grey, self.period_px, seen.crop))
-        )
+        if self.warp.needed:
+            return warped_phases(self.networks, seen.grey, self.learned.period_px, self.warp)
+        scene = FringeScene.of(seen.grey, self.carriers.period_px, seen.crop)
+        return phases_of(self.networks, fringe_channels(scene))
 
     def before(self, seen: CrossedObservation) -> CrossedObservation:
         """The observation with these phases."""

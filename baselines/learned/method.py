@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
 from fpp_ml_bench.baselines.phase.depth import FringeMeasurement, Measurement
-from fpp_ml_bench.baselines.phase.geometry import Periods
+from fpp_ml_bench.baselines.phase.geometry import Carriers, Periods
 from fpp_ml_bench.baselines.phase.method import (
     LIT_BACKGROUND,
     ONE_ALBEDO,
@@ -39,6 +39,7 @@ from fpp_ml_bench.baselines.phase.settings import (
     WHITE_GREY,
     Settings,
 )
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import PredictionError
@@ -380,7 +381,7 @@ class FringeNetMethod(LearnedRoute[Measurement]):
 
     name = "fringe-net"
     recipe = "fringe_recipe:FringeRecipe"
-    period_tolerance = 1.4
+    period_tolerance = 1.0  # an image of another period is warped for the networks alone
     purpose = "one frame, its wrapped phase learned"
     Options = FringeNetOptions
     Training = FringeNetTraining
@@ -438,23 +439,13 @@ class FringeNetMethod(LearnedRoute[Measurement]):
             hashes.append(self.file.sha256)
         self.parameters = len(networks) * self.parameters
         self.rig, self.threads = rig, given.threads
-        periods, other_pitch = self.learned_periods(fringes), {}
+        learned_px, other_pitch = self.learned_periods(fringes).best, {}
         if crossed:
-            here, learned = (
-                (code.pitches_px, code.angles_deg, code.weights)
-                for one in (rig, rig_from_dict(self.weights_config.recipe["rig"]))
-                if (code := one.crossed) is not None
-            )
-            if here != learned:
-                raise PredictionError(
-                    f"{self.file.path}: learned crossed fringes of pitches, angles and weights "
-                    f"{learned}, this rig "
-                    f"projects {here}; train networks on it, or use crossed-net or crossed, which "
-                    f"measure any"
-                )
+            learned_rig = rig_from_dict(self.weights_config.recipe["rig"])
+            learned = Carriers.of(learned_rig, learned_rig.crossed or Crossed.of_pair(learned_rig))
             self.frames_used = rig.sequence.crossed_frames[:1]
-            pair = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), periods=periods)
-            phases = CrossedPhases(pair.period_px, networks)
+            pair = TwoCarriers(rig, Settings(min_confidence=given.min_confidence))
+            phases = CrossedPhases(pair.carriers, learned, networks)
             self.route = two_carriers(pair, phases=phases.before, learned=phases.after)
         else:
             way: Direction = "vertical" if fringes == "vertical" else "horizontal"
@@ -463,8 +454,9 @@ class FringeNetMethod(LearnedRoute[Measurement]):
                 Settings(direction=way, min_confidence=given.min_confidence),
                 pitch_setting(rig, way),
             )
-            model = OneCarrier(rig, own, periods)
-            self.route = one_carrier(model, learned=FringePhase(Geometry(model), networks))
+            model = OneCarrier(rig, own)
+            part = FringePhase(Geometry(model), networks, learned_px)
+            self.route = one_carrier(model, learned=part)
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
         frame = f"one {fringes} frame{pitch_words(other_pitch)}"

@@ -88,9 +88,10 @@ PAIR_WINDOW_PERIODS = 0.06
 """Of the last fits to two frames, a few px."""
 SLOPE_PERIODS = 0.13
 """Of the Gaussian under which slopes of the phase are averaged."""
-SLACK_MM = 15.0
-"""By which the range is widened in which orders are chosen, for noise at its ends: a depth beyond
-them is left out, and no other order is taken to be within."""
+SLACK_SHARE = 0.025
+"""Of the range, by which it is widened at both ends where orders are chosen, for noise there: a
+depth beyond the range is left out, and no other order is taken to be within. 15 mm of the paper's
+600, where it was chosen on validation objects."""
 FRINGE_NOISE = 0.03
 """Uncertainty of a fringe extrapolated beyond its window, as a share of its brightness."""
 CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2
@@ -98,8 +99,8 @@ CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2
 PAIR_ROUNDS = 2  # fits to two frames over the small window
 MOST_SLACK_PERIODS = 0.07
 """Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, where
-`SLACK_MM` is less, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every
-pixel have a second order."""
+`SLACK_SHARE` is less, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost
+every pixel have a second order."""
 LEAST_CONTRAST = 0.08
 FAINT_SIGMAS = 6.0
 """Modulation of a window below which light shows no fringe: a shadow that other light reaches."""
@@ -215,7 +216,8 @@ class MeasurementModel:
         periods: Periods | None,
         frames: tuple[int, str],
     ) -> None:
-        self.settings, self.frames, self.slack_mm = settings, frames, SLACK_MM
+        near, far = rig.working_range_mm
+        self.settings, self.frames, self.slack_mm = settings, frames, SLACK_SHARE * (far - near)
         self.resampling = Resampling.of(rig, seen_px, periods or Periods())
         self.rig = self.resampling.rig
 
@@ -272,7 +274,7 @@ class OneCarrier(MeasurementModel):
         most_slack_mm = (
             MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
         )
-        self.slack_mm = min(SLACK_MM, most_slack_mm)
+        self.slack_mm = min(self.slack_mm, most_slack_mm)
         self.period_px = rig.image_px_per_period(settings.direction)
         self._scene = EmptyScene(
             rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey

@@ -256,6 +256,20 @@ class Rig:
         stays as it is."""
         return replace(self, camera=self.camera.scaled(size))
 
+    def times(self, factor: float) -> "Rig":
+        """The rig with all its lengths ``factor`` times as long: it sees an object ``factor`` times
+        as large as this one sees the object."""
+        x, y, z = (factor * length for length in self.translation_m)
+        near, far = (factor * end for end in self.working_range_mm)
+        behind = None if self.background_m is None else factor * self.background_m
+        return replace(
+            self,
+            translation_m=(x, y, z),
+            working_range_mm=(near, far),
+            standoff_m=factor * self.standoff_m,
+            background_m=behind,
+        )
+
     def with_crossed(self, crossed: Crossed) -> "Rig":
         """The rig with the frames of ``crossed`` before its own; with others in place of its
         crossed frames."""

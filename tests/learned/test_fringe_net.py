@@ -144,14 +144,15 @@ def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None
     crop = seen.crop
     cut = truth[:, *crop]
     if fringes == "crossed":
-        part = CrossedPhases(model.period_px, [Perfect(cut)])
+        part = CrossedPhases(model.carriers, model.carriers, [Perfect(cut)])
         route, measured = (
             two_carriers(model, phases=part.before, learned=part.after),
             two_carriers(model),
         )
     else:
         rotation = Geometry(model).rotation
-        part = FringePhase(Geometry(model), [Perfect(rotation.turn(cut) * rotation.sign)])
+        perfect = Perfect(rotation.turn(cut) * rotation.sign)
+        part = FringePhase(Geometry(model), [perfect], model.period_px)
         route, measured = one_carrier(model, learned=part), one_carrier(model)
     found = part.phases(seen)
     assert np.abs(wrapped(found.phase_rad - truth[:, *crop])).max() < 1e-3
@@ -215,7 +216,7 @@ def test_a_training_in_small_is_resumed_and_predicts(
         FringeNetMethod.for_rig(LINES, members=4)
 
 
-def test_crossed_fringes_that_were_not_learned_are_refused(
+def test_crossed_fringes_that_were_not_learned_are_warped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
@@ -227,10 +228,11 @@ def test_crossed_fringes_that_were_not_learned_are_refused(
         method.frames_used == CROSSED.sequence.crossed_frames[:1]
         and method.settings["fringes"] == "crossed"
     )
-    with pytest.raises(
-        PredictionError, match=r"learned crossed fringes .*18.*this rig projects .*12"
-    ):
-        FringeNetMethod.for_rig(crossed_rig(480, "crossed-12"), weights=trained.weights)
+    other = crossed_rig(480, "crossed-12")
+    warped = FringeNetMethod.for_rig(other, weights=trained.weights)
+    image = np.random.default_rng(0).integers(0, 256, (480, 480)).astype(np.uint8)
+    frames = [image if number == 0 else None for number in range(len(other.sequence))]
+    assert warped.answer(frames).depth.shape == (480, 480)
 
 
 def test_networks_and_recipes_that_are_refused() -> None:

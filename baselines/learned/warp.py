@@ -1,0 +1,107 @@
+"""The warp of an image to the carriers that a network learned from, which lets one network measure
+on any rig.
+
+A network knows fringes of one period and direction in the image. An affine map of the image puts
+one carrier there, or two at once: where carrier k has the phase ``k_rig . p`` at the pixel p, and
+the network learned ``k . p'``, the map ``p' = T p`` with ``K T = S K_rig`` brings both together, K
+the rows k and S the signs. The phases come back less those of their carriers, as complex numbers,
+so that they are interpolated without their wraps.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase.geometry import Carriers, Image, wrapped
+from fpp_ml_bench.constants import TAU
+
+NEAR_SHARE = 0.02
+"""Largest difference of the map from none at which the image stays as it is: within it a network
+has met all periods and angles, since a fringe's period differs by more over the relief of an
+object."""
+SHARPEST_PX = 0.45
+"""Sigma of the blur that a pixel of the shrunk image has anyway, in its pixels: what is added
+before it is shrunk makes the whole as wide."""
+
+
+@dataclass(frozen=True)
+class Warp:
+    """From pixels of an image to those of the network's. ``matrix`` float64 (2, 2): T. ``step_rad``
+    (K, 2): change of each learned phase per px of the network's along x and y. ``signs`` (K,): +-1,
+    of the phases."""
+
+    matrix: NDArray[np.float64]
+    step_rad: NDArray[np.float64]
+    signs: NDArray[np.float64]
+
+    @classmethod
+    def of_pair(cls, carriers: Carriers, learned: Carriers) -> "Warp":
+        """Of two carriers. A phase that grows with nearness does so in the network's image too:
+        where a sign asks for it, the image is mirrored."""
+        signs = np.prod([_signs(one) for one in (carriers, learned)], axis=0)
+        matrix = np.linalg.solve(learned.step_rad, signs[:, None] * carriers.step_rad)
+        return cls(matrix, learned.step_rad, signs)
+
+    @classmethod
+    def of_one(cls, step_rad: NDArray[np.float64], learned_px: float) -> "Warp":
+        """Of one carrier, whose phase changes by ``step_rad`` (2,) per px along x and y, to one that
+        grows downwards with a period of ``learned_px``: the image is turned and scaled."""
+        x, y = step_rad * (learned_px / TAU)
+        return cls(np.array([[y, -x], [x, y]]), np.array([[0.0, TAU / learned_px]]), np.ones(1))
+
+    @property
+    def needed(self) -> bool:
+        """Whether the image is not left as it is."""
+        return bool(np.abs(self.matrix - np.eye(2)).max() > NEAR_SHARE)
+
+    def image(self, grey: Image) -> Image:
+        """The image float32 (h, w) as the network knows it; beyond its borders it is mirrored."""
+        size, move = self._frame(grey.shape)
+        least = float(np.linalg.svd(self.matrix, compute_uv=False).min())
+        if least < 1:  # shrunk: finer detail than a pixel of the smaller image goes first
+            grey = cv2.GaussianBlur(grey, (0, 0), SHARPEST_PX * np.sqrt(1 / least**2 - 1))  # type: ignore[assignment]
+        affine = np.column_stack([self.matrix, move])
+        return cv2.warpAffine(  # type: ignore[return-value]
+            grey, affine, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
+
+    def back(self, phase_rad: Image, maps: Sequence[Image], shape: tuple[int, ...]) -> list[Image]:
+        """Phases (K, h', w') of the network's image at the pixels of an image of ``shape`` (h, w),
+        in [-pi, pi], and behind them other ``maps`` (h', w') of it, interpolated."""
+        _, (right, down) = self._frame(shape)
+        x, y = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+        (a, b), (c, d) = self.matrix
+        across, along = a * x + b * y + right, c * x + d * y + down
+        places = across.astype(np.float32), along.astype(np.float32)
+
+        def taken(image: NDArray) -> NDArray:
+            smooth = image.astype(np.float32)
+            return cv2.remap(smooth, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+        own_x, own_y = np.meshgrid(*(np.arange(n) for n in phase_rad.shape[:0:-1]))
+        phases = []
+        for phase, (along_x, along_y), sign in zip(
+            phase_rad, self.step_rad, self.signs, strict=True
+        ):
+            beside = phase - (along_x * own_x + along_y * own_y)
+            carrier = along_x * across + along_y * along
+            angle = np.arctan2(taken(np.sin(beside)), taken(np.cos(beside)))
+            phases.append(wrapped(sign * (angle + carrier)).astype(np.float32))
+        return [np.stack(phases), *map(taken, maps)]
+
+    def _frame(self, shape: tuple[int, ...]) -> tuple[tuple[int, int], NDArray[np.float64]]:
+        """Width and height of the network's image of one of ``shape`` (h, w), and what is added to
+        ``T p`` for all of it to lie within."""
+        height, width = shape
+        corners = self.matrix @ [[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1]]
+        least = corners.min(axis=1)
+        across, down = np.ceil(corners.max(axis=1) - least).astype(int) + 1
+        return (int(across), int(down)), -least
+
+
+def _signs(carriers: Carriers) -> NDArray[np.float64]:
+    """Whether each phase grows with nearness (1) or falls (-1)."""
+    return np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in carriers.gain])

@@ -1,0 +1,91 @@
+"""The warp that brings fringes of any rig to those that a network learned from."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines.learned.warp import Warp
+from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.constants import TAU
+from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.rig import Rig
+
+LEARNED = crossed_rig(960)
+
+
+def mirrored(rig: Rig) -> Rig:
+    """The projector on the other side of the camera, above instead of below."""
+    x, y, z = rig.translation_m
+    return replace(rig, translation_m=(-x, -y, z))
+
+
+OTHERS = {
+    "smaller": crossed_rig(640),
+    "larger": crossed_rig(1280),
+    "other angles": crossed_rig(960).with_crossed(Crossed((14.0, 10.0), (100.0, 20.0))),
+    "other signs": mirrored(crossed_rig(800)),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_both_carriers_come_to_those_that_were_learned(name: str) -> None:
+    """Plane waves of the rig's carriers become plane waves of the learned ones, of the same sign,
+    and phases measured there come back as those of the image."""
+    rig = OTHERS[name]
+    carriers, learned = (Carriers.of(one, one.crossed) for one in (rig, LEARNED))
+    warp = Warp.of_pair(carriers, learned)
+    assert warp.needed
+    y, x = np.mgrid[:90, :120]
+    phases = carriers.step_rad[:, :1, None] * x + carriers.step_rad[:, 1:, None] * y
+    phases += np.array([0.3, -1.1])[:, None, None]
+    image = warp.image((100 + 40 * np.cos(phases).sum(axis=0)).astype(np.float32))
+    own_y, own_x = np.mgrid[: image.shape[0], : image.shape[1]]
+    waves = [
+        np.exp(1j * (along_x * own_x + along_y * own_y)) for along_x, along_y in learned.step_rad
+    ]
+    place = np.linalg.inv(warp.matrix) @ (
+        np.stack([own_x, own_y]).reshape(2, -1) + warp._frame((90, 120))[1][:, None] * -1
+    )
+    seen = ((place > 12) & (place < np.array([[107], [77]]))).all(axis=0).reshape(image.shape)
+    basis = np.stack(
+        [np.ones(seen.sum())] + [part for w in waves for part in (w[seen].real, w[seen].imag)],
+        axis=1,
+    )
+    fitted, *_ = np.linalg.lstsq(basis, image[seen], rcond=None)
+    assert np.abs(basis @ fitted - image[seen]).max() < 4
+    amplitudes = np.hypot(fitted[1::2], fitted[2::2])
+    assert amplitudes == pytest.approx([40, 40], rel=0.1)
+    found = np.stack(
+        [
+            wrapped(np.angle(wave * complex(cosine, -sine)))
+            for wave, cosine, sine in zip(waves, fitted[1::2], fitted[2::2], strict=True)
+        ]
+    )
+    back, sigma = warp.back(found.astype(np.float32), [np.full(image.shape, 0.1)], (90, 120))
+    assert np.abs(wrapped(back - phases)).max() < 0.02 and sigma == pytest.approx(0.1)
+    gains = [np.sign(np.median(one.gain, axis=(1, 2))) for one in (carriers, learned)]
+    assert (gains[0] * warp.signs == gains[1]).all()
+
+
+def test_the_rig_of_the_weights_is_left_as_it_is() -> None:
+    carriers = Carriers.of(LEARNED, LEARNED.crossed)
+    assert not Warp.of_pair(carriers, carriers).needed
+    assert not Warp.of_one(np.array([0.002, TAU / 22.5]), 22.56).needed
+
+
+def test_one_carrier_is_turned_and_scaled_to_grow_downwards() -> None:
+    step_rad = TAU / 9 * np.array([np.sin(0.4), np.cos(0.4)])
+    warp = Warp.of_one(step_rad, 18.0)
+    y, x = np.mgrid[:60, :80]
+    phase = step_rad[0] * x + step_rad[1] * y
+    place = np.tensordot(warp.matrix, np.stack([x, y]), axes=1)
+    assert np.abs(place[1] * TAU / 18 - phase).max() < 1e-9
+    assert np.linalg.det(warp.matrix) == pytest.approx(4)  # twice as large, not mirrored
+    image = warp.image((100 + 50 * np.cos(phase)).astype(np.float32))
+    assert image.shape[0] > 120
+    down = TAU / 18 * np.arange(image.shape[0])[:, None] + np.zeros(image.shape)
+    offset = warp._frame((60, 80))[1][1] * TAU / 18
+    (back,) = warp.back(wrapped(down - offset)[None].astype(np.float32), [], (60, 80))
+    assert np.abs(wrapped(back[0] - phase)).max() < 1e-3
