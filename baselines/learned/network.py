@@ -196,32 +196,37 @@ class PhaseNet(Refiner):
 
 
 class FringeNet(Refiner):
-    """(B, 2, H, W) -> (B, 3 K, H, W): of K ``carriers`` the numerators of the wrapped phases, then
+    """(B, C, H, W) -> (B, 3 K, H, W): of K ``carriers`` the numerators of the wrapped phases, then
     the denominators, in the amplitude of the surroundings, then the logarithms of the scale in rad
-    of the phase errors. ``widths``: channels of each level, the first at half the image's
-    resolution; ``fine``: of the maps at full resolution. H and W must be multiples of
-    ``stride``."""
-
-    channels = 2
+    of the phase errors; and with ``mask`` (B, 3 K + 1, H, W): last the logit of a pixel to be
+    object, for which the input has two channels more. ``widths``: channels of each level, the first
+    at half the image's resolution; ``fine``: of the maps at full resolution. H and W must be
+    multiples of ``stride``."""
 
     def __init__(
-        self, carriers: int = 1, widths: tuple[int, ...] = (32, 48, 64, 96), fine: int = 16
+        self,
+        carriers: int = 1,
+        widths: tuple[int, ...] = (32, 48, 64, 96),
+        fine: int = 16,
+        mask: bool = False,
     ) -> None:
         super().__init__()
         widths = tuple(widths)
-        if not widths or min((*widths, fine)) < 1 or carriers not in (1, 2):
+        if not widths or min((*widths, fine)) < 1 or carriers not in (1, 2, 3):
             raise NetworkError(
-                f"expected 1 or 2 carriers and positive widths; got {carriers}, {widths}, fine "
+                f"expected 1 to 3 carriers and positive widths; got {carriers}, {widths}, fine "
                 f"{fine}"
             )
         self.options = {"carriers": carriers, "widths": list(widths), "fine": fine}
+        self.options |= {"mask": True} if mask else {}
+        self.channels, self.mask = 4 if mask else 2, mask
         self.stride, self.carriers = BLOCK * 2 ** (len(widths) - 1), carriers
         self.body = UNet(self.channels * BLOCK**2, widths)
         self.spread = nn.Conv2d(widths[0], fine * BLOCK**2, 1)
         self.fine = nn.Sequential(
             nn.Conv2d(fine + self.channels, fine, 3, padding=1), nn.ReLU(inplace=True)
         )
-        self.answer = nn.Conv2d(fine, 3 * carriers, 1)
+        self.answer = nn.Conv2d(fine, 3 * carriers + mask, 1)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         self.check(x)
@@ -229,8 +234,9 @@ class FringeNet(Refiner):
         answers = self.answer(
             self.fine(torch.cat([functional.pixel_shuffle(deep, BLOCK), x], dim=1))
         )
-        vectors, scales = answers[:, : 2 * self.carriers], answers[:, 2 * self.carriers :]
-        return (torch.cat([vectors, scales.clamp(*LOG_SCALES)], dim=1),)
+        count = self.carriers
+        vectors, scales = answers[:, : 2 * count], answers[:, 2 * count : 3 * count]
+        return (torch.cat([vectors, scales.clamp(*LOG_SCALES), answers[:, 3 * count :]], dim=1),)
 
 
 REACH = 2  # px to the farthest neighbour along an axis

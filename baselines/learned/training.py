@@ -36,6 +36,7 @@ from fpp_ml_bench.baselines.learned.network import (
 from fpp_ml_bench.baselines.learned.odds import Answers, decided_mask
 from fpp_ml_bench.baselines.learned.scenes import (
     HELD_OUT,
+    Group,
     View,
     fingerprint_of,
     groups_of,
@@ -378,6 +379,22 @@ class Task(ABC):
     decoded: tuple[Direction, ...] = ()
     scored_share: ClassVar[int] = 3
 
+    def measured(
+        self, groups: list[Group], rig: Rig, folder: Path, workers: int, show: bool
+    ) -> tuple[list[Any], list[Any]]:
+        """Training and validation samples of the views of ``groups``, which are rendered where
+        ``folder`` does not hold them yet."""
+        render_views(groups, rig, self.frames, folder, workers, show, self.decoded)
+        count = sum(len(group.views) for group in groups)
+        with Display("measuring views", count, show) as display:
+
+            def of_split(split: str, unions: int) -> list[Sample]:
+                views, done = read_views(folder, groups, split), int(display.tasks[0].completed)
+                followed = display.track(views, completed=done, task_id=display.bar)
+                return self.samples(with_unions(followed, unions, self.recipe.seed))
+
+            return of_split("train", self.recipe.unions), of_split("validation", 0)
+
     @abstractmethod
     def samples(self, views: Iterable[View]) -> list[Sample]:
         """The samples of views; a view that can't be used has none."""
@@ -548,20 +565,7 @@ def train_net(
         weights = out / f"{recipe.weights_name}.safetensors"
         if not weights.exists():
             task = recipe.task(rig)
-            render_views(groups, rig, task.frames, out / VIEWS, workers, show, task.decoded)
-            with Display(
-                "measuring views", sum(len(group.views) for group in groups), show
-            ) as display:
-
-                def measured(split: str, unions: int) -> list[Sample]:
-                    views, done = (
-                        read_views(out / VIEWS, groups, split),
-                        int(display.tasks[0].completed),
-                    )
-                    followed = display.track(views, completed=done, task_id=display.bar)
-                    return task.samples(with_unions(followed, unions, recipe.seed))
-
-                samples, validation = measured("train", recipe.unions), measured("validation", 0)
+            samples, validation = task.measured(groups, rig, out / VIEWS, workers, show)
             with reproducible(cpu=True):
                 start_network = None if first is None else first.network
                 scored = validation[:: task.scored_share]

@@ -44,6 +44,8 @@ MOST_WRONG_SHARE, MOST_EXPECTED_SHARE = 0.04, 0.0025
 LINES_PX = 22.0
 """Image px that a period of the fringes of one direction covers, as near as whole projector px
 allow: that of the paper's rig."""
+PERIOD_PX, TRIED = (6.0, 40.0), 24
+"""Image px that a period of crossed fringes may cover, and how many periods between are tried."""
 _GRID = 9
 _DIGITS = 9
 """Decimals of a drawn number: the last bits of a cosine differ between processors."""
@@ -198,8 +200,10 @@ def _coded(rig: Rig) -> Rig | None:
         pitch_vertical_px=pitches[1],
         sequence=Sequence(18, *bits),
     )
+    covered = math.hypot(*rig.image_frequency((1.0, 0.0)))
+    tried = {float(round(px * covered)) for px in np.geomspace(*PERIOD_PX, TRIED)}
     try:
-        found = search(rig, Assumptions()).proposed
+        found = search(rig, Assumptions(image_px=PERIOD_PX), tried).proposed
         rig.check_sampling()
     except RigError:
         return None

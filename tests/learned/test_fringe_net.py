@@ -240,8 +240,8 @@ def test_networks_and_recipes_that_are_refused() -> None:
     assert network(torch.zeros(1, 2, 8, 12))[0].shape == (1, 6, 8, 12)
     assert FringeNet(**network.options).options == network.options
     assert sum(parameter.numel() for parameter in FringeRecipe().network().parameters()) < 1_000_000
-    with pytest.raises(NetworkError, match="1 or 2 carriers"):
-        FringeNet(3)
+    with pytest.raises(NetworkError, match="1 to 3 carriers"):
+        FringeNet(4)
     with pytest.raises(NetworkError, match="multiples of 4"):
         network(torch.zeros(1, 2, 6, 8))
     with pytest.raises(RecipeError, match="lines or crossed"):

@@ -1,0 +1,371 @@
+"""Training fringe-net for any rig: one network that gives, from one frame of one carrier or two, the
+numerator and denominator of each carrier's wrapped phase, their scale, and whether a pixel is
+object.
+
+Its windows are cut from images of drawn rigs (`rig_views`) and warped to the carriers of
+`canonical`, with periods, angles and skews drawn around them. The truth is that of the exact depth;
+its brightness is that of the phase steps of the same view in the same light.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fpp_ml_bench.baselines.learned.fringe_net import (
+    FringeScene,
+    fringe_channels,
+)
+from fpp_ml_bench.baselines.learned.network import FringeNet, mask_loss, mean_over, scale_loss
+from fpp_ml_bench.baselines.learned.odds import SCALE_TO_SIGMA
+from fpp_ml_bench.baselines.learned.rig_views import (
+    NEITHER,
+    OBJECT,
+    FringeImage,
+    read_images,
+    render_settings,
+    settings_of,
+)
+from fpp_ml_bench.baselines.learned.scenes import Group
+from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, Task
+from fpp_ml_bench.baselines.learned.warp import SHARPEST_PX
+from fpp_ml_bench.baselines.learned.windows import Window, mean_scores
+from fpp_ml_bench.baselines.phase.geometry import Carriers, Image, wrapped
+from fpp_ml_bench.baselines.training.weights import FRINGE_NETWORKS, Family
+from fpp_ml_bench.constants import TAU
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
+from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.rig import Rig
+
+LINE, PAIR = (0,), (1, 2)
+"""Places of one carrier, and of two, among the network's three."""
+KNOWN_PX = {1: 18.0, 2: 15.0}
+"""Image px a period that a network knows best, of one carrier and of two; the second is that of the
+paper's rig."""
+PERIOD_RATIO = 0.7, 1.6
+"""Limits of the periods in training windows, over `KNOWN_PX`."""
+TURN_RAD, SKEW = 0.1, 0.08
+"""Largest rotation of a training window, and standard deviation of its skew and stretch: over an
+image of a rig whose axes meet at 20 degrees the carriers change as much."""
+SMALL = 0.05
+"""Error of M and D below which its loss is quadratic, in the amplitude of the surroundings."""
+CLAMP = 4.0
+"""Largest M and D that are learned, in that amplitude."""
+TWO_SIDED_RAD = 1.0
+"""With which a missed or an invented pixel counts in validation, as one of a wrong order does."""
+
+
+@cache
+def canonical(carriers: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a network knows best: change (K, 2) in rad per px along x and y of the carriers' phases,
+    and their signs (K,), 1 where a phase grows with nearness. One grows downwards; two are those of
+    the paper's rig."""
+    if carriers == 1:
+        return np.array([[0.0, TAU / KNOWN_PX[1]]]), np.ones(1)
+    rig = crossed_rig()
+    assert rig.crossed is not None
+    pair = Carriers.of(rig, rig.crossed)
+    signs = np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in pair.gain])
+    return pair.step_rad, signs
+
+
+def to_canonical(
+    step_rad: NDArray[np.float64], signs: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The map (2, 2) from pixels of an image, whose carriers have ``step_rad`` (K, 2) and ``signs``
+    (K,), to those of the canonical one, and the signs (K,) by which the phases are multiplied."""
+    known, known_signs = canonical(len(signs))
+    turned = signs * known_signs
+    if len(signs) == 2:
+        return np.linalg.solve(known, turned[:, None] * step_rad), turned
+    x, y = turned[0] * step_rad[0] / known[0, 1]
+    return np.array([[y, -x], [x, y]]), turned
+
+
+@dataclass(frozen=True)
+class RigRecipe(StepRecipe):
+    """``rigs``: that are drawn, with ``views_a_light`` views of training objects before each and as
+    many times ``unions``; ``validation_rigs``; ``widths`` and ``fine``: of the network;
+    ``near_edge``: share of windows beside depth edges; ``crossed``: of windows with two carriers;
+    ``no_plane``: of windows that the empty scene tells nothing of; ``weight_*``: of the losses."""
+
+    name: str = "fringe-net"
+    steps: int = 24000
+    batch: int = 6
+    window: int = 160
+    rate: float = 2e-3
+    averaged: float = 0.999
+    validate_every: int = 1500
+    rigs: int = 120
+    views_a_light: int = 6
+    unions: int = 1
+    validation_rigs: int = 6
+    widths: tuple[int, ...] = (32, 48, 64, 96)
+    fine: int = 16
+    near_edge: float = 0.5
+    crossed: float = 0.6
+    no_plane: float = 0.15
+    weight_phase: float = 10.0
+    weight_scale: float = 0.1
+    weight_mask: float = 0.5
+
+    family: ClassVar[Family] = FRINGE_NETWORKS
+    main_loss: ClassVar[str] = "phase"
+    scores: ClassVar[dict[str, dict[str, str]]] = {
+        "validation, phase error in rad": {
+            "crossed_interior_rad": "crossed, interior",
+            "crossed_edge_rad": "crossed, edge",
+            "line_interior_rad": "one carrier, interior",
+            "line_edge_rad": "one carrier, edge",
+        },
+        "validation, % of object pixels": {
+            "missed_percent": "missed",
+            "invented_percent": "invented",
+        },
+    }
+
+    @property
+    def title(self) -> str:  # type: ignore[override]
+        return f"Wrapped phases and mask of one carrier or two, on any rig, seed {self.seed}"
+
+    @property
+    def weights_name(self) -> str:
+        return f"{self.name}-{self.seed}"
+
+    def network(self) -> FringeNet:
+        return FringeNet(3, self.widths, self.fine, mask=True)
+
+    def losses(self, network: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """``phase``: smooth L1 of M and D in the amplitude of the surroundings; ``scale``: negative
+        log-likelihood of the phase error in rad under a Laplace distribution; ``mask``: binary
+        cross-entropy."""
+        (answer,), truth, fitted = network(batch["x"]), batch["truth"], batch["fitted"]
+        count = truth.shape[1] // 2
+        vectors, scale = answer[:, : 2 * count], answer[:, 2 * count : 3 * count]
+        by_pixel = functional.smooth_l1_loss(vectors, truth, beta=SMALL, reduction="none")
+        phase, true = (
+            torch.atan2(maps[:, :count], maps[:, count:]) for maps in (vectors.detach(), truth)
+        )
+        error = torch.atan2(torch.sin(phase - true), torch.cos(phase - true)).abs()
+        return {
+            "phase": mean_over(by_pixel, torch.cat([fitted, fitted], dim=1)),
+            "scale": scale_loss(error, scale, fitted),
+            "mask": mask_loss(answer[:, -1], batch["target"], batch["mask_valid"]),
+        }
+
+    def task(self, rig: Rig) -> "RigTask":
+        return RigTask(self)
+
+
+class RigTask(Task):
+    """What fringe-net learns of many rigs."""
+
+    scored_share = 3
+    frames = ()
+
+    def __init__(self, recipe: RigRecipe) -> None:
+        self.recipe: RigRecipe = recipe
+
+    def measured(
+        self, groups: list[Group], rig: Rig, folder: Path, workers: int, show: bool
+    ) -> tuple[list[FringeImage], list[FringeImage]]:
+        """Training and validation images, photographed where ``folder`` does not hold them yet."""
+        recipe = self.recipe
+        settings = settings_of(
+            recipe.rigs, recipe.views_a_light, recipe.validation_rigs, recipe.seed
+        )
+        render_settings(settings, folder, recipe.unions, workers, show)
+        training, validation = (
+            list(read_images(settings, folder, split)) for split in ("train", "validation")
+        )
+        return training, validation
+
+    def samples(self, views: Any) -> list[Any]:
+        return list(views)
+
+    def draw(self, samples: list[FringeImage], random: np.random.Generator) -> Window:
+        """A random window: ``x``, the network's input; ``truth`` (6, n, n), M and D, and where they
+        count, ``fitted`` (3, n, n); ``target`` and ``mask_valid`` (n, n)."""
+        recipe = self.recipe
+        crossed = random.random() < recipe.crossed
+        while True:
+            image = samples[int(random.integers(len(samples)))]
+            if (image.fringes == "crossed") == crossed:
+                break
+        matrix, signs = to_canonical(image.step_rad, image.signs)
+        least, most = np.log(PERIOD_RATIO)
+        matrix = _jitter(random, float(np.exp(random.uniform(least, most)))) @ matrix
+        if not crossed and random.random() < 0.5:  # along its fringes one carrier has no direction
+            matrix = np.diag([-1.0, 1.0]) @ matrix
+        size = recipe.window
+        if len(image.edges) and random.random() < recipe.near_edge:
+            row, column = image.edges[int(random.integers(len(image.edges)))]
+        else:
+            row, column = (int(random.integers(length)) for length in image.grey.shape)
+        place = np.array([column, row], np.float64)
+        place += np.linalg.inv(matrix) @ random.uniform(-size / 3, size / 3, 2)
+        # What lies beyond the image teaches nothing.
+        half = size / 2 * np.abs(np.linalg.inv(matrix)).sum(axis=1)
+        ends = np.array(image.grey.shape[::-1], np.float64)
+        place = np.clip(place, np.minimum(half, ends / 2), np.maximum(ends - half, ends / 2))
+        move = size / 2 - matrix @ place
+        window = _warped(image, matrix, signs, move, (size, size))
+        if random.random() < recipe.no_plane:
+            window["x"][2:] = 0
+        return window
+
+    def score(self, network: FringeNet, image: FringeImage) -> dict[str, float | None]:
+        """Mean phase error in rad of an image's object beyond `EDGE_BAND_PX` from its silhouette,
+        and nearer; whether it is within the stated standard uncertainty; object pixels missed and
+        background pixels invented, in percent of the object's."""
+        matrix, signs = to_canonical(image.step_rad, image.signs)
+        matrix = matrix * known_scale(matrix)
+        height, width = image.grey.shape
+        corners = matrix @ [[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1]]
+        least = corners.min(axis=1)
+        across, down = np.ceil(corners.max(axis=1) - least).astype(int) + 1
+        window = _warped(image, matrix, signs, -least, (int(down), int(across)))
+        (answer,) = network.outputs(window["x"])
+        places = list(PAIR if len(signs) == 2 else LINE)
+        phase = np.arctan2(answer[:3], answer[3:6])[places]
+        truth = np.arctan2(window["truth"][:3], window["truth"][3:])[places]
+        target = window["fitted"][places[0]]
+        error = np.abs(wrapped(phase - truth)).mean(axis=0)
+        sigma = (SCALE_TO_SIGMA * np.exp(answer[6:9]))[places].mean(axis=0)
+        inner = (
+            cv2.erode(target.astype(np.uint8), np.ones((2 * EDGE_BAND_PX + 1,) * 2, np.uint8)) > 0
+        )
+        object_px = int(target.sum())
+        found, valid = answer[9] > 0, window["mask_valid"]
+
+        def mean(where: NDArray) -> float | None:
+            return float(error[where].mean(dtype=np.float64)) if where.any() else None
+
+        kind = "crossed" if len(signs) == 2 else "line"
+        return {
+            f"{kind}_interior_rad": mean(inner),
+            f"{kind}_edge_rad": mean(target & ~inner),
+            "within_percent": 100 * float((error < sigma)[target].mean()) if object_px else None,
+            "missed_percent": 100 * float((~found)[target].mean()) if object_px else None,
+            "invented_percent": 100
+            * float((found & valid & ~window["target"]).sum())
+            / max(object_px, found.size // 10),
+        }
+
+    def scores(self, network: FringeNet, samples: list[FringeImage]) -> dict[str, float]:
+        return mean_scores(self.score(network, image) for image in samples)
+
+    def chosen(
+        self,
+        network: FringeNet,
+        samples: list[FringeImage],
+        validation: list[FringeImage],
+        out: Path,
+    ) -> dict[str, Any]:
+        return {
+            "threshold": 0.0,
+            "period_px": {"line": KNOWN_PX[1], "crossed": KNOWN_PX[2]},
+            "validation": self.scores(network, validation),
+        }
+
+
+def known_scale(matrix: NDArray[np.float64]) -> float:
+    """By how much an image that ``matrix`` would bring to `KNOWN_PX` stays larger or smaller: the
+    least change of size that brings it within `PERIOD_RATIO`, some way from its ends."""
+    size = float(np.sqrt(abs(np.linalg.det(matrix))))
+    least, most = PERIOD_RATIO
+    return float(np.clip(1 / size, least * 1.1, most / 1.15))
+
+
+def _jitter(random: np.random.Generator, scale: float) -> NDArray[np.float64]:
+    """A rotation, a skew and a stretch, all small, and a change of size."""
+    turn = random.uniform(-TURN_RAD, TURN_RAD)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    stretch = np.eye(2) + np.clip(random.normal(0, SKEW, (2, 2)), -2 * SKEW, 2 * SKEW)
+    return np.asarray(scale * rotation @ stretch)
+
+
+def _warped(
+    image: FringeImage,
+    matrix: NDArray[np.float64],
+    signs: NDArray[np.float64],
+    move: NDArray[np.float64],
+    shape: tuple[int, int],
+) -> Window:
+    """The window of ``shape`` (h, w) at whose pixel ``matrix p + move`` the image's pixel p is;
+    what lies outside the image counts nowhere."""
+    # The part of the image that the window shows, and a rim for interpolation.
+    height, width = shape
+    back = np.linalg.inv(matrix)
+    corners = back @ (
+        np.array([[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1]]) - move[:, None]
+    )
+    rim = 4 + int(np.ceil(2 * np.abs(back).max()))
+    (left, top), (right, bottom) = corners.min(axis=1), corners.max(axis=1)
+    rows = slice(max(int(top) - rim, 0), max(int(bottom) + rim + 1, 1))
+    columns = slice(max(int(left) - rim, 0), max(int(right) + rim + 1, 1))
+    grey, misfit, label, phase, bright = (
+        maps[..., rows, columns]
+        for maps in (image.grey, image.misfit, image.label, image.phase_rad, image.bright)
+    )
+    if not grey.size:  # the window shows nothing of the image
+        grey, label = np.zeros((1, 1), np.uint8), np.full((1, 1), NEITHER, np.uint8)
+        misfit, bright = (np.zeros((1, 1), np.float16) for _ in range(2))
+        phase = np.zeros((len(signs), 1, 1), np.float16)
+    move = move + matrix @ np.array([columns.start, rows.start], np.float64)
+    affine = np.column_stack([matrix, move])
+    size = (width, height)
+
+    def taken(maps: NDArray, border: int = cv2.BORDER_CONSTANT, value: float = 0) -> Image:
+        return cv2.warpAffine(  # type: ignore[return-value]
+            maps, affine, size, flags=cv2.INTER_LINEAR, borderMode=border, borderValue=value
+        )
+
+    light = grey.astype(np.float32)
+    least = float(np.linalg.svd(matrix, compute_uv=False).min())
+    if least < 1:
+        light = cv2.GaussianBlur(light, (0, 0), SHARPEST_PX * np.sqrt(1 / least**2 - 1))  # type: ignore[assignment]
+    light = cv2.warpAffine(  # type: ignore[assignment]
+        light, affine, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
+    step_rad = signs[:, None] * image.step_rad
+    period_px = float((TAU / np.linalg.norm(step_rad @ back, axis=1)).max())
+    scene = FringeScene.of(light, period_px, (slice(0, height), slice(0, width)))
+    shown = np.full(shape, image.shown, np.float32)
+    x = np.concatenate(
+        [fringe_channels(scene), [taken(misfit.astype(np.float32), cv2.BORDER_REFLECT), shown]]
+    )
+    target = taken((label == OBJECT).astype(np.float32))
+    neither = taken((label == NEITHER).astype(np.float32), value=1.0)
+    inside, valid = (target > 0.5) & (neither < 0.25), neither < 0.25
+    own_x, own_y = np.meshgrid(np.arange(grey.shape[1]), np.arange(grey.shape[0]))
+    back_x, back_y = np.meshgrid(np.arange(width), np.arange(height))
+    source = np.tensordot(back, np.stack([back_x - move[0], back_y - move[1]]), axes=1)
+    truth, fitted = np.zeros((6, *shape), np.float32), np.zeros((3, *shape), bool)
+    places = PAIR if len(signs) == 2 else LINE
+    share = np.float32(1 / len(signs))
+    amplitude = bright.astype(np.float32) * share
+    for place, sign, own, (along_x, along_y) in zip(places, signs, phase, step_rad, strict=True):
+        beside = sign * own.astype(np.float32) - (along_x * own_x + along_y * own_y)
+        real, imaginary = (
+            taken((amplitude * wave(beside)).astype(np.float32)) for wave in (np.cos, np.sin)
+        )
+        angle = np.arctan2(imaginary, real) + along_x * source[0] + along_y * source[1]
+        strength = np.hypot(real, imaginary) / np.maximum(target, 1e-3) / scene.unit_grey
+        strength = np.clip(strength, 0, CLAMP)
+        truth[place], truth[3 + place] = strength * np.sin(angle), strength * np.cos(angle)
+        fitted[place] = inside
+    return {
+        "x": np.ascontiguousarray(x, np.float32),
+        "truth": truth * inside,
+        "fitted": fitted,
+        "target": inside,
+        "mask_valid": valid,
+    }
