@@ -39,11 +39,11 @@ from fpp_ml_bench.baselines.training.engine import Display
 from fpp_ml_bench.coding.phase_shift import wrapped_phase
 from fpp_ml_bench.constants import MM_PER_M, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.depth import depth_edges
-from fpp_ml_bench.design.rigs import drawn_rig, volume_scale
+from fpp_ml_bench.design.rigs import drawn_rig
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.render.light import Light, named_light
-from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.scene import BuildSettings, volume_scale
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics.named_rigs import crossed_rig

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.training.engine import Display
 from fpp_ml_bench.coding.phase_shift import wrapped_phase
-from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, OBJECTS, VIEWS, split_of
+from fpp_ml_bench.constants import GREY_LEVELS, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.render.light import Light, named_light
@@ -88,9 +88,8 @@ def photographed(
     = background, and the pixels' `Flag`."""
     scene = studio.trace(solid_mesh(name), view)
     studio.expose(scene, frames)
-    depth_mm = np.zeros((studio.rig.camera.height, studio.rig.camera.width), np.float32)
-    depth_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
-    return np.stack([studio.frame(frame) for frame in frames]), depth_mm, studio.flags(scene)[0]
+    images = np.stack([studio.frame(frame) for frame in frames])
+    return images, studio.exact_mm(scene), studio.flags(scene)[0]
 
 
 HELD_OUT = ("camera-blur", "dark-paint")

@@ -11,12 +11,14 @@ from fpp_ml_bench.coding.gray_code import bits_needed
 from fpp_ml_bench.constants import CONFIGS, LARGEST_SIDE_PX, PRESETS
 from fpp_ml_bench.loaders.render.builder import assembly_of, explain_build
 from fpp_ml_bench.loaders.render.builder import build as build_dataset
+from fpp_ml_bench.loaders.render.light import NAMED as NAMED_LIGHTS
 from fpp_ml_bench.loaders.render.light import load_light
 from fpp_ml_bench.loaders.render.meshes import read_mesh_list, single_mesh
-from fpp_ml_bench.loaders.render.scene import BuildSettings, default_frames
+from fpp_ml_bench.loaders.render.scene import BuildSettings, default_frames, volume_scale
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.storage.card import ground_truth_summary
 from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
+from fpp_ml_bench.optics.rig import middle_m
 from fpp_ml_bench.optics.rig_file import load_rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS
 from fpp_ml_bench.options import REQUIRED, option
@@ -57,6 +59,13 @@ class BuildCommandSettings(Explain, Pool):
         "the paper's, the same with crossed fringes (also crossed-10, crossed-18), or a rig file "
         "(default: paper)",
         "paper|crossed|FILE",
+    )
+    object_scale: float | None = option(
+        None,
+        "size of the benchmark's objects, 1 their own (default: what fits the working volume of the "
+        "rig)",
+        "N",
+        parse=value("a number above 0", float, lambda scale: 0 < scale < 1e6),
     )
     decode_with: Path | None = option(
         None,
@@ -124,7 +133,18 @@ def settings_of(given: BuildCommandSettings) -> "BuildSettings":
         light = light.changed("bounces", shadows=True)
     found = None if given.decode_with is None else load_rig(given.decode_with)
     stored = given.config or default_frames(given.rig)
-    return BuildSettings(rig, everything, given.placement, stored, given.seed, light, own, found)
+    scale = given.object_scale
+    if scale is None:
+        scale = 1.0 if given.rig in NAMED_RIGS or not objects else volume_scale(rig)
+    if scale != 1:  # the light is that of the scaled world
+        own_focus_m = light.projector.focus_m / scale
+        middle = middle_m(rig.times(1 / scale).working_range_mm)
+        light = light.changed(
+            "projector", focus_m=middle if given.light in NAMED_LIGHTS else own_focus_m
+        )
+    return BuildSettings(
+        rig, everything, given.placement, stored, given.seed, light, own, found, scale
+    )
 
 
 @command(
@@ -168,6 +188,8 @@ def build(settings: BuildCommandSettings) -> None:
         else "complete already"
     )
     print(f"{out}: {contents(manifest)}; {rate}")
+    if (scale := build_settings.object_scale) != 1:
+        print(f"  objects, textures and focus are {scale:g} times as large as in the benchmark")
     for line in ground_truth_summary(manifest):
         print(f"  {line}")
     say_benchmark(manifest)

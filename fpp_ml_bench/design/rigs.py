@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.gray_code import bits_needed
-from fpp_ml_bench.constants import MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
+from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.design.search import Assumptions, Candidate, search
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG, paper_rig
+from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 from fpp_ml_bench.optics.sequence import Sequence
@@ -104,26 +104,6 @@ def axes_deg(rig: Rig) -> float:
     to_projector = -rig.R.T @ rig.t - point
     cosine = -to_projector[2] / np.sqrt((to_projector**2).sum())
     return math.degrees(math.acos(min(max(float(cosine), -1.0), 1.0)))
-
-
-def volume_scale(rig: Rig) -> float:
-    """How many times as large as in the paper's rig an object may be so that each of the benchmark's
-    objects fits: the smallest of both volumes' depths and widths compared."""
-    (near, far), standoff = rig.working_range_mm, rig.standoff_m * MM_PER_M
-    paper_near, paper_far = WORKING_RANGE_MM
-    paper_mm = STANDOFF_M * MM_PER_M
-    before = min(paper_mm - paper_near, paper_far - paper_mm)
-    by_depth = min(standoff - near, far - standoff) / before
-    reached = _half_width(paper_rig().camera) * paper_near
-    width = _half_width(rig.camera)
-    # The nearest point of a scaled object lies ``before`` times the scale before the standoff.
-    return min(by_depth, standoff * width / (reached + before * width))
-
-
-def _half_width(camera: Pinhole) -> float:
-    """Tangent of half the narrower field of view."""
-    across = min(camera.cx, camera.width - 1 - camera.cx) / camera.fx
-    return min(across, min(camera.cy, camera.height - 1 - camera.cy) / camera.fy)
 
 
 def _layout(random: np.random.Generator) -> Rig:

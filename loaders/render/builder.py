@@ -36,7 +36,7 @@ class PhotographedRows:
         mesh = None
         for _, name, view in plan.samples:
             if mesh is None or mesh.name != name:
-                mesh = solid_mesh(name, self.settings.user_meshes)
+                mesh = self.settings.sized(solid_mesh(name, self.settings.user_meshes))
                 write_ply(mesh, folder / MESH_FOLDER / f"{name}.ply")
             yield self.studio.photograph(mesh, view)
 

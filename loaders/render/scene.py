@@ -17,10 +17,21 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import CONFIGS, MM_PER_M, OBJECTS, PRESETS, UNSEEN, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.constants import (
+    CONFIGS,
+    MM_PER_M,
+    OBJECTS,
+    PRESETS,
+    STANDOFF_M,
+    UNSEEN,
+    VIEW_DEGREES,
+    VIEWS,
+    WORKING_RANGE_MM,
+)
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
+from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.portable import cosine_of_turns, matrix_product, sine_of_turns
@@ -33,6 +44,8 @@ PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
 PHOTOGRAPHED_BY = "photographed_by"
 """Key of the settings that holds the true rig of a dataset that was decoded with another."""
 
+SAME_VOLUME = 0.02
+"""Difference of a rig's volume from that of the paper's, which a calibration of it may have."""
 _MARGIN_PX = 2.0
 
 
@@ -56,7 +69,9 @@ class BuildSettings:
     """Everything that decides the bytes of a dataset.
 
     ``rig`` photographs. ``decode_with`` is what a calibration found of it: the ground truth is
-    decoded with that rig, and it is the dataset's, as in a lab.
+    decoded with that rig, and it is the dataset's, as in a lab. ``object_scale``: how many times
+    their size the benchmark's objects have, with all that is on them and the lens's focus; users'
+    meshes keep theirs.
 
     ``objects`` and ``user_meshes`` are kept in one order, the benchmark's, the unseen ones and then
     the users' by name, whatever order they were given in: it is the order of the rows.
@@ -70,8 +85,11 @@ class BuildSettings:
     light: Light = field(default_factory=lambda: named_light("paper"))
     user_meshes: tuple[UserMesh, ...] = field(default=())
     decode_with: Rig | None = None
+    object_scale: float = 1.0
 
     def __post_init__(self) -> None:
+        if not 0 < self.object_scale < math.inf:
+            raise BuildError(f"object scale {self.object_scale:g}: expected a number above 0")
         names = {*OBJECTS, *UNSEEN, *(mesh.name for mesh in self.user_meshes)}
         for name in self.objects:
             if name not in names:
@@ -106,7 +124,19 @@ class BuildSettings:
         if self.light.projector.defocus_px > 0:
             from fpp_ml_bench.loaders.render.projector import check_focus  # loads numba
 
-            check_focus(self.rig, self.light.projector)
+            check_focus(self.unit_rig, self.light.projector)
+
+    @property
+    def unit_rig(self) -> Rig:
+        """The rig in the unit of length in which the benchmark's objects have their own size."""
+        return self.rig if self.object_scale == 1 else self.rig.times(1 / self.object_scale)
+
+    def sized(self, mesh: SolidMesh) -> SolidMesh:
+        """``mesh`` in the size in which it is built."""
+        own = any(mesh.name == one.name for one in self.user_meshes)
+        if own or self.object_scale == 1:
+            return mesh
+        return replace(mesh, vertices_m=mesh.vertices_m * self.object_scale)
 
     @property
     def stated_rig(self) -> Rig:
@@ -135,6 +165,8 @@ class BuildSettings:
                 for mesh in self.user_meshes
             ],
         }
+        if self.object_scale != 1:
+            described["object_scale"] = self.object_scale
         return (
             described
             if self.decode_with is None
@@ -198,6 +230,31 @@ class SolidMesh:
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int32]
     paint: Paint | None = None
+
+
+def volume_scale(rig: Rig) -> float:
+    """How many times their size the benchmark's objects may have for all to fit a rig's volume,
+    rounded down to three digits: the smaller of what the working range and the field of view hold,
+    by what those of the paper's rig do; 1 for what differs from it by less than `SAME_VOLUME`."""
+    (near, far), standoff = rig.working_range_mm, rig.standoff_m * MM_PER_M
+    paper_near, paper_far = WORKING_RANGE_MM
+    paper_standoff = STANDOFF_M * MM_PER_M
+    before = min(paper_standoff - paper_near, paper_far - paper_standoff)
+    by_depth = min(standoff - near, far - standoff) / before
+    width, paper_width = (_half_view(one.camera) for one in (rig, NAMED_RIGS["paper"]()))
+    # The nearest point of an object lies ``before`` times the scale before the standoff.
+    by_view = standoff * width / (paper_width * paper_near + before * width)
+    scale = min(by_depth, by_view)
+    if abs(scale - 1) < SAME_VOLUME:
+        return 1.0
+    digits = 2 - math.floor(math.log10(scale))
+    return math.floor(scale * 10**digits) / 10**digits
+
+
+def _half_view(camera: Pinhole) -> float:
+    """Tangent from the axis to the nearest border of the image."""
+    across = min(camera.cx + 0.5, camera.width - 0.5 - camera.cx) / camera.fx
+    return min(across, min(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy)
 
 
 def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:

@@ -2,7 +2,7 @@
 separates them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,10 @@ class Studio:
 
     def __init__(self, settings: BuildSettings) -> None:
         self.settings, self.light = settings, settings.light
-        self.rig = rig = photographing_rig(settings.rig, self.light.calibration_px, settings.seed)
+        # Lengths are in the unit of `BuildSettings.unit_rig` until they leave the studio.
+        unit_rig, error_px = settings.unit_rig, self.light.calibration_px
+        self.rig = rig = photographing_rig(unit_rig, error_px, settings.seed)
+        self._shrunk: tuple[SolidMesh, SolidMesh] | None = None
         self.exposure = Exposure.of(rig, self.light)
         self.lighting = Lighting(rig, self.light, self.exposure.pattern)
         camera = rig.camera
@@ -87,13 +90,13 @@ class Studio:
         and so the decoded depth, are the same either way. With skipping off
         (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
         """
-        scene = self.trace(mesh, view)
+        settings, scene = self.settings, self.trace(mesh, view)
         shadow_rays = self.expose_view(mesh, view, scene)
         exact_mm = self.exact_mm(scene)
         depth_mm = self.ground_truth_mm(object_mask(exact_mm))
         if not depth_mm.any():
             counts = decode_stack(
-                self._frames, self.settings.stated_rig, mask=object_mask(exact_mm)
+                self._frames, settings.stated_rig, mask=object_mask(exact_mm)
             ).counts
             counts["not_asked"] = 0
             reasons = ", ".join(
@@ -105,7 +108,8 @@ class Studio:
                 f"decoded ({reasons}); check the rig's pose and code, and how bright --light is"
             )
         flags, cover = self.flags(scene)
-        measured = {"distance_mm": scene.distance_m * MM_PER_M, "shadow_rays": shadow_rays}
+        distance_mm = scene.distance_m * settings.object_scale * MM_PER_M
+        measured = {"distance_mm": distance_mm, "shadow_rays": shadow_rays}
         measured["mixed_rays"] = 0 if scene.mixed is None else len(scene.mixed.points_m)
         measured |= ground_truth_error(depth_mm, exact_mm, flags)
         frames = {index: self._frames[index] for index in self.stored}
@@ -127,18 +131,24 @@ class Studio:
         """The object in its place, or ``moved_m`` (3,) from there, seen and lit."""
         settings, rig, light = self.settings, self.rig, self.light
         vertices_m, distance_m = place(mesh, view, settings.rig, settings.placement, settings.seed)
+        if settings.object_scale != 1:
+            vertices_m, distance_m = (
+                length / settings.object_scale for length in (vertices_m, distance_m)
+            )
+            mesh = self._in_unit(mesh)
         offset_m = np.array([0.0, 0.0, distance_m])
         if moved_m is not None:
             vertices_m, offset_m = vertices_m + moved_m, offset_m + moved_m
         traced = TracedObject(mesh, vertices_m)
         hits = traced.primary(PixelRays.of(rig.camera))
         if not hits.pixels.size:
-            size_mm = MM_PER_M * float(np.ptp(vertices_m, axis=0).max())
-            pixel_mm = MM_PER_M * distance_m / rig.camera.fx
+            unit_mm = MM_PER_M * settings.object_scale
+            size_mm = unit_mm * float(np.ptp(vertices_m, axis=0).max())
+            pixel_mm = unit_mm * distance_m / rig.camera.fx
             raise MeshError(
                 f"object {mesh.name!r} is on no pixel in view {view}: it is {size_mm:.3g} mm "
                 f"large, and a pixel "
-                f"{distance_m:g} m from the camera is {pixel_mm:.3g} mm; scale it up, or build "
+                f"{distance_m * settings.object_scale:g} m from the camera is {pixel_mm:.3g} mm; scale it up, or build "
                 f"with more px (--size)"
             )
         stream = (settings.seed, mesh.name, view)
@@ -155,10 +165,18 @@ class Studio:
             traced, distance_m, hits, lit, mixed, mixed_lit, self.brightness(stream), stream
         )
 
+    def _in_unit(self, mesh: SolidMesh) -> SolidMesh:
+        """``mesh``, the same one for all its views, in the studio's unit of length."""
+        if self._shrunk is None or self._shrunk[0] is not mesh:
+            vertices_m = mesh.vertices_m / self.settings.object_scale
+            self._shrunk = mesh, replace(mesh, vertices_m=vertices_m)
+        return self._shrunk[1]
+
     def exact_mm(self, scene: TracedView) -> NDArray[np.float32]:
         """Exact depth (H, W) of what the camera sees of the object, 0 beyond."""
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
-        exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
+        unit_mm = MM_PER_M * self.settings.object_scale
+        exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * unit_mm
         return exact_mm
 
     def brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:
