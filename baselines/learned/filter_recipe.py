@@ -23,7 +23,7 @@ from fpp_ml_bench.baselines.learned.routes import (
     filtered,
 )
 from fpp_ml_bench.baselines.learned.scenes import View
-from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, Task
+from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, ViewTask
 from fpp_ml_bench.baselines.learned.windows import Sample, Window, mean_scores, view_scores
 from fpp_ml_bench.baselines.training.weights import FILTER_NETWORKS, Family
 from fpp_ml_bench.optics.rig import Rig
@@ -115,7 +115,7 @@ class FilterRecipe(StepRecipe):
         return FilterTask(self, rig)
 
 
-class FilterTask(Task):
+class FilterTask(ViewTask):
     """What classical-net learns: the frames of a decoded depth."""
 
     def __init__(self, recipe: FilterRecipe, rig: Rig) -> None:

@@ -27,7 +27,7 @@ from fpp_ml_bench.baselines.learned.fringe_net import (
 from fpp_ml_bench.baselines.learned.inputs import Geometry
 from fpp_ml_bench.baselines.learned.network import FringeNet, mean_over, scale_loss
 from fpp_ml_bench.baselines.learned.scenes import View
-from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, Task
+from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, ViewTask
 from fpp_ml_bench.baselines.learned.windows import Sample, Window, mean_scores, padded
 from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
 from fpp_ml_bench.baselines.phase.object_mask import crop_around
@@ -116,7 +116,7 @@ class FringeRecipe(StepRecipe):
         return FringeTask(self, rig)
 
 
-class FringeTask(Task):
+class FringeTask(ViewTask):
     """What fringe-net learns of a rig. ``decoded``: the directions whose steps tell the truth."""
 
     scored_share = 2

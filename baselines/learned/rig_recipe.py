@@ -84,8 +84,8 @@ def to_canonical(
     known, known_signs = canonical(len(signs))
     turned = signs * known_signs
     if len(signs) == 2:
-        return np.linalg.solve(known, turned[:, None] * step_rad), turned
-    x, y = turned[0] * step_rad[0] / known[0, 1]
+        return np.asarray(np.linalg.solve(known, turned[:, None] * step_rad), np.float64), turned
+    x, y = (float(step) for step in turned[0] * step_rad[0] / known[0, 1])
     return np.array([[y, -x], [x, y]]), turned
 
 
@@ -164,11 +164,8 @@ class RigRecipe(StepRecipe):
         return RigTask(self)
 
 
-class RigTask(Task):
+class RigTask(Task[FringeImage]):
     """What fringe-net learns of many rigs."""
-
-    scored_share = 3
-    frames = ()
 
     def __init__(self, recipe: RigRecipe) -> None:
         self.recipe: RigRecipe = recipe
@@ -186,9 +183,6 @@ class RigTask(Task):
             list(read_images(settings, folder, split)) for split in ("train", "validation")
         )
         return training, validation
-
-    def samples(self, views: Any) -> list[Any]:
-        return list(views)
 
     def draw(self, samples: list[FringeImage], random: np.random.Generator) -> Window:
         """A random window: ``x``, the network's input; ``truth`` (6, n, n), M and D, and where they

@@ -11,7 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -166,13 +167,15 @@ def read_images(settings: Sequence[Setting], folder: Path, split: str) -> Iterat
         try:
             with np.load(file, allow_pickle=False) as arrays:
                 maps = {key: arrays[key] for key in arrays.files}
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             words = f"can't be read ({error}); delete it and run the same command again"
             raise TrainingError(f"{file}: {words}") from None
         for number in range(int(maps["count"])):
-            part = {entry.name: maps[f"{number}-{entry.name}"] for entry in fields(FringeImage)}
-            words = {key: str(part.pop(key)) for key in ("name", "setting", "fringes")}
-            yield FringeImage(**words, shown=bool(part.pop("shown")), **part)  # type: ignore[arg-type]
+            part: dict[str, Any] = {
+                entry.name: maps[f"{number}-{entry.name}"] for entry in fields(FringeImage)
+            }
+            part |= {key: str(part[key]) for key in ("name", "setting", "fringes")}
+            yield FringeImage(**part | {"shown": bool(part["shown"])})
 
 
 def _file(folder: Path, setting: Setting) -> Path:
@@ -181,12 +184,12 @@ def _file(folder: Path, setting: Setting) -> Path:
 
 def _render(work: tuple[Path, int], setting: Setting) -> None:
     folder, unions = work
-    content = {}
+    content: dict[str, Any] = {}
     images = list(_images(setting, unions if setting.split == "train" else 0))
     for number, image in enumerate(images):
         content |= {f"{number}-{e.name}": getattr(image, e.name) for e in fields(FringeImage)}
     file = BytesIO()
-    np.savez_compressed(file, count=len(images), **content)  # type: ignore[arg-type]
+    np.savez_compressed(file, count=len(images), **content)
     write_atomically(_file(folder, setting), file.getvalue(), sync=False)
 
 
@@ -212,12 +215,12 @@ def _images(setting: Setting, unions: int) -> Iterator[FringeImage]:
         void = (flags & VOID) != 0
         photographs.append(View(f"{name}_{view}", name, setting.name, frames, depth_mm, void))
     kinds: list[_Crossed | _Line] = [_Crossed(rig), *(_Line(rig, way) for way in DIRECTIONS)]
-    for number, view in enumerate(with_unions(photographs, unions, studio.settings.seed)):
-        if not view.target.any():
+    for number, seen in enumerate(with_unions(photographs, unions, studio.settings.seed)):
+        if not seen.target.any():
             continue
         others = (1, 2) if setting.split == "validation" else (1 + number % 2,)
         for which in (0, *others):
-            yield from kinds[which].cut(view, view.frames[which], view.frames[3], number)
+            yield from kinds[which].cut(seen, seen.frames[which], seen.frames[3], number)
 
 
 class _Kind:

@@ -18,6 +18,7 @@ from itertools import groupby
 from math import exp, log
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -256,7 +257,7 @@ def read_views(folder: Path, groups: list[Group], split: str) -> Iterator[View]:
             try:
                 with np.load(file, allow_pickle=False) as arrays:
                     maps = arrays["frames"], arrays["depth_mm"], arrays["void"]
-            except (OSError, ValueError, KeyError, EOFError) as error:
+            except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
                 words = f"can't be read ({error}); delete it and run the same command again"
                 raise TrainingError(f"{file}: {words}") from None
             yield View(f"{name}_{view}", name, group.name, *maps)

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -84,6 +84,7 @@ so."""
 LARGEST_GRADIENT = 50.0
 MOST = {"views_a_light": 40, "unions": 100}  # of a recipe
 
+SampleT = TypeVar("SampleT")
 Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
 
 
@@ -166,7 +167,7 @@ class StepRecipe(ABC):
         """Of ``network`` on a batch, by the names of `weights`."""
 
     @abstractmethod
-    def task(self, rig: Rig) -> "Task":
+    def task(self, rig: Rig) -> "Task[Any]":
         """What the network learns from views of ``rig``."""
 
     def rate_at(self, step: int) -> float:
@@ -255,9 +256,9 @@ class WindowTraining(Training):
 
     def __init__(
         self,
-        task: "Task",
-        samples: list[Sample],
-        scored: list[Sample],
+        task: "Task[Any]",
+        samples: list[Any],
+        scored: list[Any],
         out: Path,
         start: PhaseNet | None = None,
         show: bool = False,
@@ -368,22 +369,47 @@ class WindowTraining(Training):
         return [panel("training losses", shown, log=True), *scores]
 
 
-class Task(ABC):
-    """What a network learns from rendered views of a rig: samples of the views, windows of the
-    samples, and what is chosen on validation samples. ``frames``: those it takes, and behind them
-    what the steps of the directions ``decoded`` tell; of the validation samples every
-    ``scored_share``-th is scored during training."""
+class Task(ABC, Generic[SampleT]):
+    """What a network learns from rendered views: samples of the views, windows of the samples, and
+    what is chosen on validation samples, of which every ``scored_share``-th is scored during
+    training."""
 
     recipe: Any
+    scored_share: ClassVar[int] = 3
+
+    @abstractmethod
+    def measured(
+        self, groups: list[Group], rig: Rig, folder: Path, workers: int, show: bool
+    ) -> tuple[list[SampleT], list[SampleT]]:
+        """Training and validation samples of views, which are rendered where ``folder`` does not
+        hold them yet: of ``groups`` by ``rig``."""
+
+    @abstractmethod
+    def draw(self, samples: list[SampleT], random: np.random.Generator) -> Window:
+        """A random window of one of ``samples``, varied."""
+
+    @abstractmethod
+    def scores(self, network: Any, samples: list[SampleT]) -> dict[str, float]:
+        """Mean scores of a network."""
+
+    @abstractmethod
+    def chosen(
+        self, network: Any, samples: list[SampleT], validation: list[SampleT], out: Path
+    ) -> dict[str, Any]:
+        """The fields of `training.NetConfig` that are chosen on the validation samples for the
+        trained network, and its scores there; pictures of that go to ``out``."""
+
+
+class ViewTask(Task[Sample]):
+    """That of one rig. ``frames``: those it takes, and behind them what the steps of the directions
+    ``decoded`` tell."""
+
     frames: tuple[int, ...]
     decoded: tuple[Direction, ...] = ()
-    scored_share: ClassVar[int] = 3
 
     def measured(
         self, groups: list[Group], rig: Rig, folder: Path, workers: int, show: bool
-    ) -> tuple[list[Any], list[Any]]:
-        """Training and validation samples of the views of ``groups``, which are rendered where
-        ``folder`` does not hold them yet."""
+    ) -> tuple[list[Sample], list[Sample]]:
         render_views(groups, rig, self.frames, folder, workers, show, self.decoded)
         count = sum(len(group.views) for group in groups)
         with Display("measuring views", count, show) as display:
@@ -399,23 +425,8 @@ class Task(ABC):
     def samples(self, views: Iterable[View]) -> list[Sample]:
         """The samples of views; a view that can't be used has none."""
 
-    @abstractmethod
-    def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:
-        """A random window of one of ``samples``, varied."""
 
-    @abstractmethod
-    def scores(self, network: Any, samples: list[Sample]) -> dict[str, float]:
-        """Mean scores of a network."""
-
-    @abstractmethod
-    def chosen(
-        self, network: Any, samples: list[Sample], validation: list[Sample], out: Path
-    ) -> dict[str, Any]:
-        """The fields of `training.NetConfig` that are chosen on the validation samples for the
-        trained network, and its scores there; pictures of that go to ``out``."""
-
-
-class CandidateTask(Task):
+class CandidateTask(ViewTask):
     """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are
     tried on the validation samples, thresholds also on every ``chosen_share``-th training sample;
     sums of errors ``tolerance_mm`` from the least count as equal, and for fewer missed pixels the

@@ -151,10 +151,10 @@ def _device(
     """``throw``: limits of the focal length by the width."""
     width, height = sizes[int(random.integers(len(sizes)))]
     focal = round(width * float(random.uniform(*throw)), 1)
-    centre = [round(float(n / 2 + random.normal(0, 0.01 * n)), 1) for n in (width, height)]
+    cx, cy = (round(float(n / 2 + random.normal(0, 0.01 * n)), 1) for n in (width, height))
     k1, k2 = (round(float(random.uniform(-0.12, 0.06)), 3), round(float(random.normal(0, 0.02)), 3))
     lens = (k1, k2, 0.0, 0.0, 0.0) if distorted else (0.0,) * 5
-    return Pinhole(width, height, focal, focal, *centre, lens)
+    return Pinhole(width, height, focal, focal, cx, cy, lens)
 
 
 def _towards(direction: NDArray[np.float64], roll_rad: float) -> NDArray[np.float64]:

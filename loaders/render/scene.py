@@ -150,7 +150,7 @@ class BuildSettings:
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with
         this one."""
-        described = {
+        described: dict[str, Any] = {
             "objects": list(self.objects),
             "placement": self.placement,
             "frames": self.stored,

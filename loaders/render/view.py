@@ -132,10 +132,8 @@ class Studio:
         settings, rig, light = self.settings, self.rig, self.light
         vertices_m, distance_m = place(mesh, view, settings.rig, settings.placement, settings.seed)
         if settings.object_scale != 1:
-            vertices_m, distance_m = (
-                length / settings.object_scale for length in (vertices_m, distance_m)
-            )
-            mesh = self._in_unit(mesh)
+            vertices_m = vertices_m / settings.object_scale
+            distance_m, mesh = distance_m / settings.object_scale, self._in_unit(mesh)
         offset_m = np.array([0.0, 0.0, distance_m])
         if moved_m is not None:
             vertices_m, offset_m = vertices_m + moved_m, offset_m + moved_m

@@ -1,0 +1,129 @@
+"""Training on drawn rigs: what an image and a window show, and a small training."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fpp_ml_bench.baselines.learned import rig_recipe
+from fpp_ml_bench.baselines.learned.network import FringeNet
+from fpp_ml_bench.baselines.learned.rig_recipe import RigRecipe, canonical, to_canonical
+from fpp_ml_bench.baselines.learned.rig_views import (
+    OBJECT,
+    FringeImage,
+    Setting,
+    read_images,
+    render_settings,
+    settings_of,
+)
+from fpp_ml_bench.baselines.learned.training import train_net
+from fpp_ml_bench.baselines.phase.geometry import wrapped
+from fpp_ml_bench.constants import TAU, split_of
+from fpp_ml_bench.errors import NetworkError, TrainingError
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.optics.named_rigs import crossed_rig
+
+RIG, LIGHT = crossed_rig(320, "crossed-18"), named_light("paper")
+SETTINGS = [
+    Setting("train-000", RIG, LIGHT, (("wood_block", "A0"), ("duct_tape", "A60"))),
+    Setting("validation-00", RIG, LIGHT, (("mug", "A0"),), "validation"),
+]
+SMALL = RigRecipe(
+    steps=30,
+    batch=2,
+    window=64,
+    warm_up=1,
+    widths=(8, 12),
+    fine=8,
+    validate_every=15,
+    averaged=0.9,
+)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> list[FringeImage]:
+    folder = tmp_path_factory.mktemp("settings")
+    render_settings(SETTINGS, folder, 1, 1, False)
+    return list(read_images(SETTINGS, folder, "train"))
+
+
+def test_images_hold_object_and_surroundings_of_all_fringes(images: list[FringeImage]) -> None:
+    assert {image.fringes for image in images} == {"crossed", "horizontal", "vertical"}
+    assert {image.name for image in images if "+" in image.name}  # unions
+    for image in images:
+        assert image.shown and len(image.step_rad) == len(image.signs)
+        light = image.grey.astype(np.float32)
+        inside = image.label == OBJECT
+        shape = image.phase_rad.astype(np.float32)
+        if inside.sum() < 2000:
+            continue
+        expected = np.cos(shape).sum(axis=0)[inside]
+        assert np.corrcoef(light[inside] / (1 + image.bright[inside]), expected)[0, 1] > 0.85
+        outside = image.misfit[image.label == 0].astype(np.float32)
+        assert np.median(np.abs(outside)) < 0.5  # the wall is explained, the object is not
+        assert np.median(np.abs(image.misfit[inside].astype(np.float32))) > 0.5
+
+
+def test_windows_show_the_phases_that_are_asked_for(images: list[FringeImage]) -> None:
+    task, random = SMALL.task(RIG), np.random.default_rng(0)
+    seen = set()
+    for _ in range(60):
+        window = task.draw(images, random)
+        places = tuple(np.flatnonzero(window["fitted"].any(axis=(1, 2))))
+        fitted = window["fitted"].any(axis=0)
+        assert window["x"].shape == (4, 64, 64) and not (fitted & ~window["mask_valid"]).any()
+        if fitted.sum() < 400:
+            continue
+        seen.add(places)
+        light = window["truth"][3:].sum(axis=0)[fitted]
+        assert np.corrcoef(window["x"][1][fitted], light)[0, 1] > 0.7
+        if places == (0,):
+            phase = np.arctan2(window["truth"][0], window["truth"][3])
+            down = wrapped(np.diff(phase, axis=0))[fitted[1:] & fitted[:-1]]
+            assert 0.1 < np.median(down) < 0.6
+    assert seen == {(0,), (1, 2)}
+
+
+def test_any_carriers_come_to_the_canonical_ones() -> None:
+    known, signs = canonical(2)
+    matrix, turned = to_canonical(known, signs)
+    assert matrix == pytest.approx(np.eye(2)) and (turned == 1).all()
+    mirrored, turned = to_canonical(known * [[1], [-1]], signs * [1, -1])
+    assert mirrored == pytest.approx(np.eye(2)) and turned.tolist() == [1, -1]
+    step_rad = TAU / 9 * np.array([[np.cos(0.3), np.sin(0.3)]])
+    matrix, _ = to_canonical(step_rad, np.ones(1))
+    assert canonical(1)[0] @ matrix == pytest.approx(step_rad)
+
+
+def test_settings_are_drawn_again_the_same_and_of_their_split() -> None:
+    first, again = (settings_of(2, 3, 1, 7) for _ in range(2))
+    assert first == again and [one.split for one in first] == ["train"] * 2 + ["validation"] * 3
+    for setting in first:
+        assert {split_of(name) for name, _ in setting.views} == {setting.split}
+        assert setting.light.calibration_px == 0
+
+
+@pytest.mark.long
+def test_a_training_in_small_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig_recipe, "settings_of", lambda *args: SETTINGS)
+    out = tmp_path / "run"
+    stopped = train_net(SMALL, out, minutes=1e-9)
+    assert stopped.weights is None and stopped.steps == 15
+    trained = train_net(SMALL, out)
+    assert trained.weights == out / "fringe-net-42.safetensors"
+    assert 0 < trained.validation["crossed_interior_rad"] < 2
+    assert {"line_edge_rad", "missed_percent", "invented_percent"} <= trained.validation.keys()
+    file = next((out / "views").glob("train-000*"))
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(TrainingError, match="delete it"):
+        list(read_images(SETTINGS, out / "views", "train"))
+
+
+def test_the_network_has_a_mask_and_three_carriers() -> None:
+    network = RigRecipe().network()
+    assert network(torch.zeros(1, 4, 32, 48))[0].shape == (1, 10, 32, 48)
+    assert FringeNet(**network.options).options == network.options
+    assert sum(parameter.numel() for parameter in network.parameters()) < 1_000_000
+    with pytest.raises(NetworkError, match="1 to 3 carriers"):
+        FringeNet(4, mask=True)
