@@ -73,21 +73,23 @@ class Phases:
     sigma_rad: Image
 
 
-def phases_of(networks: Sequence[FringeNet], x: Image) -> Phases:
-    """The answer of one network or several to the input ``x`` (C, h, w)."""
+def phases_of(networks: Sequence[FringeNet], x: Image) -> tuple[Phases, Image]:
+    """The answer of one network or several to the input ``x`` (C, h, w): phases, and the logit
+    (h, w) of a pixel to be object, 0 of networks without a mask."""
     answers = [network.outputs(x)[0] for network in networks]
     total = np.sum(answers, axis=0)
     count = len(total) // 3
     phase = np.arctan2(total[:count], total[count : 2 * count])
     variance: NDArray = np.mean(
-        [(SCALE_TO_SIGMA * np.exp(one[2 * count :])) ** 2 for one in answers], axis=0
+        [(SCALE_TO_SIGMA * np.exp(one[2 * count : 3 * count])) ** 2 for one in answers], axis=0
     )
     if len(answers) > 1:
         apart = [
             wrapped(np.arctan2(one[:count], one[count : 2 * count]) - phase) for one in answers
         ]
         variance = variance + np.sum(np.square(apart), axis=0) / (len(answers) - 1)
-    return Phases(phase.astype(np.float32), np.sqrt(variance).astype(np.float32))
+    logit = total[3 * count :].sum(axis=0, dtype=np.float32) / len(answers)
+    return Phases(phase.astype(np.float32), np.sqrt(variance).astype(np.float32)), logit
 
 
 def warped_phases(
@@ -97,7 +99,7 @@ def warped_phases(
     ``period_px``, the longer one of two, that the networks learned from."""
     image = warp.image(grey)
     scene = FringeScene.of(image, period_px, (slice(0, image.shape[0]), slice(0, image.shape[1])))
-    found = phases_of(networks, fringe_channels(scene))
+    found, _ = phases_of(networks, fringe_channels(scene))
     phase_rad, *sigmas = warp.back(found.phase_rad, [*found.sigma_rad], grey.shape)
     return Phases(phase_rad, np.stack(sigmas))
 
@@ -130,7 +132,7 @@ class FringePhase:
             turned = warped_phases(self.networks, grey, self.learned_px, self.warp)
         else:
             x = fringe_channels(FringeScene.of(grey, self.geometry.period_px, seen.crop))
-            turned = phases_of(self.networks, np.ascontiguousarray(rotation.turn(x)))
+            turned, _ = phases_of(self.networks, np.ascontiguousarray(rotation.turn(x)))
         phase, sigma = (
             np.ascontiguousarray(rotation.back(maps))
             for maps in (turned.phase_rad, turned.sigma_rad)
@@ -169,7 +171,7 @@ class CrossedPhases:
         if self.warp.needed:
             return warped_phases(self.networks, seen.grey, self.learned.period_px, self.warp)
         scene = FringeScene.of(seen.grey, self.carriers.period_px, seen.crop)
-        return phases_of(self.networks, fringe_channels(scene))
+        return phases_of(self.networks, fringe_channels(scene))[0]
 
     def before(self, seen: CrossedObservation) -> CrossedObservation:
         """The observation with these phases."""

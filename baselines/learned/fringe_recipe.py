@@ -208,7 +208,7 @@ class FringeTask(ViewTask):
     def answer(self, network: FringeNet, sample: Sample) -> Phases:
         """Phases of a sample, rotated for the network."""
         x = self._turned(sample, fringe_channels(sample.scene.single()))
-        return phases_of([network], np.ascontiguousarray(x))
+        return phases_of([network], np.ascontiguousarray(x))[0]
 
     def score(self, network: FringeNet, sample: Sample) -> dict[str, float | None]:
         """Mean phase error in rad of a sample's object beyond `EDGE_BAND_PX` from its silhouette,

@@ -3,12 +3,11 @@ numerator and denominator of each carrier's wrapped phase, their scale, and whet
 object.
 
 Its windows are cut from images of drawn rigs (`rig_views`) and warped to the carriers of
-`canonical`, with periods, angles and skews drawn around them. The truth is that of the exact depth;
+`warp.known`, with periods, angles and skews drawn around them. The truth is that of the exact depth;
 its brightness is that of the phase steps of the same view in the same light.
 """
 
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -35,22 +34,21 @@ from fpp_ml_bench.baselines.learned.rig_views import (
 )
 from fpp_ml_bench.baselines.learned.scenes import Group
 from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, Task
-from fpp_ml_bench.baselines.learned.warp import SHARPEST_PX
+from fpp_ml_bench.baselines.learned.warp import (
+    KNOWN_PX,
+    PERIOD_RATIO,
+    PLACES,
+    SHARPEST_PX,
+    known_scale,
+    to_known,
+)
 from fpp_ml_bench.baselines.learned.windows import Window, mean_scores
-from fpp_ml_bench.baselines.phase.geometry import Carriers, Image, wrapped
+from fpp_ml_bench.baselines.phase.geometry import Image, wrapped
 from fpp_ml_bench.baselines.training.weights import FRINGE_NETWORKS, Family
 from fpp_ml_bench.constants import TAU
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
-from fpp_ml_bench.optics.named_rigs import crossed_rig
 from fpp_ml_bench.optics.rig import Rig
 
-LINE, PAIR = (0,), (1, 2)
-"""Places of one carrier, and of two, among the network's three."""
-KNOWN_PX = {1: 18.0, 2: 15.0}
-"""Image px a period that a network knows best, of one carrier and of two; the second is that of the
-paper's rig."""
-PERIOD_RATIO = 0.7, 1.6
-"""Limits of the periods in training windows, over `KNOWN_PX`."""
 TURN_RAD, SKEW = 0.1, 0.08
 """Largest rotation of a training window, and standard deviation of its skew and stretch: over an
 image of a rig whose axes meet at 20 degrees the carriers change as much."""
@@ -60,33 +58,6 @@ CLAMP = 4.0
 """Largest M and D that are learned, in that amplitude."""
 TWO_SIDED_RAD = 1.0
 """With which a missed or an invented pixel counts in validation, as one of a wrong order does."""
-
-
-@cache
-def canonical(carriers: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What a network knows best: change (K, 2) in rad per px along x and y of the carriers' phases,
-    and their signs (K,), 1 where a phase grows with nearness. One grows downwards; two are those of
-    the paper's rig."""
-    if carriers == 1:
-        return np.array([[0.0, TAU / KNOWN_PX[1]]]), np.ones(1)
-    rig = crossed_rig()
-    assert rig.crossed is not None
-    pair = Carriers.of(rig, rig.crossed)
-    signs = np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in pair.gain])
-    return pair.step_rad, signs
-
-
-def to_canonical(
-    step_rad: NDArray[np.float64], signs: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The map (2, 2) from pixels of an image, whose carriers have ``step_rad`` (K, 2) and ``signs``
-    (K,), to those of the canonical one, and the signs (K,) by which the phases are multiplied."""
-    known, known_signs = canonical(len(signs))
-    turned = signs * known_signs
-    if len(signs) == 2:
-        return np.asarray(np.linalg.solve(known, turned[:, None] * step_rad), np.float64), turned
-    x, y = (float(step) for step in turned[0] * step_rad[0] / known[0, 1])
-    return np.array([[y, -x], [x, y]]), turned
 
 
 @dataclass(frozen=True)
@@ -193,7 +164,7 @@ class RigTask(Task[FringeImage]):
             image = samples[int(random.integers(len(samples)))]
             if (image.fringes == "crossed") == crossed:
                 break
-        matrix, signs = to_canonical(image.step_rad, image.signs)
+        matrix, signs = to_known(image.step_rad, image.signs)
         least, most = np.log(PERIOD_RATIO)
         matrix = _jitter(random, float(np.exp(random.uniform(least, most)))) @ matrix
         if not crossed and random.random() < 0.5:  # along its fringes one carrier has no direction
@@ -219,7 +190,7 @@ class RigTask(Task[FringeImage]):
         """Mean phase error in rad of an image's object beyond `EDGE_BAND_PX` from its silhouette,
         and nearer; whether it is within the stated standard uncertainty; object pixels missed and
         background pixels invented, in percent of the object's."""
-        matrix, signs = to_canonical(image.step_rad, image.signs)
+        matrix, signs = to_known(image.step_rad, image.signs)
         matrix = matrix * known_scale(matrix)
         height, width = image.grey.shape
         corners = matrix @ [[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1]]
@@ -227,7 +198,7 @@ class RigTask(Task[FringeImage]):
         across, down = np.ceil(corners.max(axis=1) - least).astype(int) + 1
         window = _warped(image, matrix, signs, -least, (int(down), int(across)))
         (answer,) = network.outputs(window["x"])
-        places = list(PAIR if len(signs) == 2 else LINE)
+        places = list(PLACES[len(signs)])
         phase = np.arctan2(answer[:3], answer[3:6])[places]
         truth = np.arctan2(window["truth"][:3], window["truth"][3:])[places]
         target = window["fitted"][places[0]]
@@ -268,14 +239,6 @@ class RigTask(Task[FringeImage]):
             "period_px": {"line": KNOWN_PX[1], "crossed": KNOWN_PX[2]},
             "validation": self.scores(network, validation),
         }
-
-
-def known_scale(matrix: NDArray[np.float64]) -> float:
-    """By how much an image that ``matrix`` would bring to `KNOWN_PX` stays larger or smaller: the
-    least change of size that brings it within `PERIOD_RATIO`, some way from its ends."""
-    size = float(np.sqrt(abs(np.linalg.det(matrix))))
-    least, most = PERIOD_RATIO
-    return float(np.clip(1 / size, least * 1.1, most / 1.15))
 
 
 def _jitter(random: np.random.Generator, scale: float) -> NDArray[np.float64]:
@@ -343,7 +306,7 @@ def _warped(
     back_x, back_y = np.meshgrid(np.arange(width), np.arange(height))
     source = np.tensordot(back, np.stack([back_x - move[0], back_y - move[1]]), axes=1)
     truth, fitted = np.zeros((6, *shape), np.float32), np.zeros((3, *shape), bool)
-    places = PAIR if len(signs) == 2 else LINE
+    places = PLACES[len(signs)]
     share = np.float32(1 / len(signs))
     amplitude = bright.astype(np.float32) * share
     for place, sign, own, (along_x, along_y) in zip(places, signs, phase, step_rad, strict=True):

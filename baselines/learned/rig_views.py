@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.learned.any_fringes import empty_scene_channel
 from fpp_ml_bench.baselines.learned.scenes import (
     VALIDATION_LIGHTS,
     View,
@@ -245,10 +246,9 @@ class _Kind:
         """The parts of a frame (H, W)."""
         grey = np.rint(frame.astype(np.float32)).astype(np.uint8)
         background = self.background(grey)
-        misfit = np.zeros(grey.shape, np.float16)
-        if background.shown:
-            sigmas = background.residual / np.float32(background.noise_grey)
-            misfit = (np.arcsinh(sigmas) / 4).astype(np.float16)
+        misfit = empty_scene_channel(
+            background.residual, background.noise_grey, background.shown
+        ).astype(np.float16)
         label = np.where(view.void, NEITHER, np.where(view.target, OBJECT, OUTSIDE))
         label = label.astype(np.uint8)
         phases = wrapped(self.phases(np.where(view.depth_mm > 0, view.depth_mm, 1000.0)))

@@ -10,6 +10,7 @@ so that they are interpolated without their wraps.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase.geometry import Carriers, Image, wrapped
 from fpp_ml_bench.constants import TAU
+from fpp_ml_bench.optics.named_rigs import crossed_rig
 
 NEAR_SHARE = 0.02
 """Largest difference of the map from none at which the image stays as it is: within it a network
@@ -25,6 +27,50 @@ object."""
 SHARPEST_PX = 0.45
 """Sigma of the blur that a pixel of the shrunk image has anyway, in its pixels: what is added
 before it is shrunk makes the whole as wide."""
+
+
+PLACES = {1: (0,), 2: (1, 2)}
+"""Which of the three carriers of a network for any rig are those of a frame with one, or two."""
+KNOWN_PX = {1: 18.0, 2: 15.0}
+"""Image px a period that a network knows best, of one carrier and of two; the second is that of the
+paper's rig."""
+PERIOD_RATIO = 0.7, 1.6
+"""Limits of the periods in training windows, over `KNOWN_PX`."""
+
+
+@cache
+def known(carriers: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a network knows best: change (K, 2) in rad per px along x and y of the carriers' phases,
+    and their signs (K,), 1 where a phase grows with nearness. One grows downwards; two are those of
+    the paper's rig."""
+    if carriers == 1:
+        return np.array([[0.0, TAU / KNOWN_PX[1]]]), np.ones(1)
+    rig = crossed_rig()
+    assert rig.crossed is not None
+    pair = Carriers.of(rig, rig.crossed)
+    signs = np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in pair.gain])
+    return pair.step_rad, signs
+
+
+def to_known(
+    step_rad: NDArray[np.float64], signs: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The map (2, 2) from pixels of an image, whose carriers have ``step_rad`` (K, 2) and ``signs``
+    (K,), to those of the known ones, and the signs (K,) by which the phases are multiplied."""
+    steps, known_signs = known(len(signs))
+    turned = signs * known_signs
+    if len(signs) == 2:
+        return np.asarray(np.linalg.solve(steps, turned[:, None] * step_rad), np.float64), turned
+    x, y = (float(step) for step in turned[0] * step_rad[0] / steps[0, 1])
+    return np.array([[y, -x], [x, y]]), turned
+
+
+def known_scale(matrix: NDArray[np.float64]) -> float:
+    """By how much an image that ``matrix`` would bring to `KNOWN_PX` stays larger or smaller: the
+    least change of size that brings it within `PERIOD_RATIO`, some way from its ends."""
+    size = float(np.sqrt(abs(np.linalg.det(matrix))))
+    least, most = PERIOD_RATIO
+    return float(np.clip(1 / size, least * 1.1, most / 1.15))
 
 
 @dataclass(frozen=True)
@@ -51,6 +97,19 @@ class Warp:
         grows downwards with a period of ``learned_px``: the image is turned and scaled."""
         x, y = step_rad * (learned_px / TAU)
         return cls(np.array([[y, -x], [x, y]]), np.array([[0.0, TAU / learned_px]]), np.ones(1))
+
+    @classmethod
+    def to_periods(cls, step_rad: NDArray[np.float64], signs: NDArray[np.float64]) -> "Warp":
+        """Of the carriers ``step_rad`` (K, 2) and ``signs`` (K,) to what `known` says, no further
+        in size than `known_scale`."""
+        matrix, turned = to_known(step_rad, signs)
+        matrix = matrix * known_scale(matrix)
+        return cls(matrix, turned[:, None] * step_rad @ np.linalg.inv(matrix), turned)
+
+    @property
+    def period_px(self) -> float:
+        """Of the longer carrier in the network's image."""
+        return float((TAU / np.linalg.norm(self.step_rad, axis=1)).max())
 
     @property
     def needed(self) -> bool:

@@ -156,7 +156,8 @@ class Observation(Capture):
     layer of the crop; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's
     phase in [-pi, pi]; ``slopes``: change of the residual phase in rad a px along x and y;
     ``mean_grey``: of pixelwise frames; ``uncertainty_rad`` float32: of the phase, without the
-    order, None for that of the fit (`depth`)."""
+    order, None for that of the fit (`depth`); ``other_phase``: another measurement of the phase,
+    and its uncertainty, in rad."""
 
     layer: CalibrationLayer
     shifts_rad: tuple[float, ...]
@@ -165,6 +166,7 @@ class Observation(Capture):
     slopes: tuple[Image, Image]
     mean_grey: Image | None
     uncertainty_rad: Image | None = None
+    other_phase: tuple[Image, Image] | None = None
 
     @cached_property
     def candidates(self) -> Orders:

@@ -102,12 +102,14 @@ CrossedRoute = Route[TwoCarriers, CrossedObservation, CrossedCandidates, Fitted,
 
 
 def one_carrier(
-    model: OneCarrier, learned: Callable[[FringeOrder], FringeOrder] | None = None
+    model: OneCarrier,
+    phases: Callable[[Observation], Observation] | None = None,
+    learned: Callable[[FringeOrder], FringeOrder] | None = None,
 ) -> FringeRoute:
     """The route of fringes of one direction."""
     order = partial(fringe_order, model.settings)
     depth = partial(fringe_depth, model)
-    return Route(model, model.observe, fringe_candidates, order, depth, learned=learned)
+    return Route(model, model.observe, fringe_candidates, order, depth, phases, learned)
 
 
 def two_carriers(

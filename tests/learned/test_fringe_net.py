@@ -170,10 +170,10 @@ def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None
 
 def test_an_ensemble_states_how_far_its_members_are_apart() -> None:
     x, phases = np.zeros((2, 8, 8), np.float32), np.linspace(-3, 3, 64).reshape(1, 8, 8)
-    alone = phases_of([Perfect(phases, 0.02)], x)  # type: ignore[list-item]
+    alone, _ = phases_of([Perfect(phases, 0.02)], x)  # type: ignore[list-item]
     assert alone.sigma_rad == pytest.approx(0.02 * np.sqrt(2), rel=1e-4)
     members = [Perfect(phases, 0.02, off) for off in (-0.3, 0.0, 0.3)]
-    three = phases_of(members, x)  # type: ignore[arg-type]
+    three, _ = phases_of(members, x)  # type: ignore[arg-type]
     assert np.abs(wrapped(three.phase_rad - phases)).max() < 1e-5
     assert three.sigma_rad == pytest.approx(np.hypot(0.02 * np.sqrt(2), 0.3), rel=1e-3)
 

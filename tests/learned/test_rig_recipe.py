@@ -8,7 +8,7 @@ import torch
 
 from fpp_ml_bench.baselines.learned import rig_recipe
 from fpp_ml_bench.baselines.learned.network import FringeNet
-from fpp_ml_bench.baselines.learned.rig_recipe import RigRecipe, canonical, to_canonical
+from fpp_ml_bench.baselines.learned.rig_recipe import RigRecipe
 from fpp_ml_bench.baselines.learned.rig_views import (
     OBJECT,
     FringeImage,
@@ -18,6 +18,7 @@ from fpp_ml_bench.baselines.learned.rig_views import (
     settings_of,
 )
 from fpp_ml_bench.baselines.learned.training import train_net
+from fpp_ml_bench.baselines.learned.warp import Warp, known, to_known
 from fpp_ml_bench.baselines.phase.geometry import wrapped
 from fpp_ml_bench.constants import TAU, split_of
 from fpp_ml_bench.errors import NetworkError, TrainingError
@@ -85,15 +86,19 @@ def test_windows_show_the_phases_that_are_asked_for(images: list[FringeImage]) -
     assert seen == {(0,), (1, 2)}
 
 
-def test_any_carriers_come_to_the_canonical_ones() -> None:
-    known, signs = canonical(2)
-    matrix, turned = to_canonical(known, signs)
+def test_any_carriers_come_to_those_that_are_known() -> None:
+    steps, signs = known(2)
+    matrix, turned = to_known(steps, signs)
     assert matrix == pytest.approx(np.eye(2)) and (turned == 1).all()
-    mirrored, turned = to_canonical(known * [[1], [-1]], signs * [1, -1])
+    mirrored, turned = to_known(steps * [[1], [-1]], signs * [1, -1])
     assert mirrored == pytest.approx(np.eye(2)) and turned.tolist() == [1, -1]
     step_rad = TAU / 9 * np.array([[np.cos(0.3), np.sin(0.3)]])
-    matrix, _ = to_canonical(step_rad, np.ones(1))
-    assert canonical(1)[0] @ matrix == pytest.approx(step_rad)
+    matrix, _ = to_known(step_rad, np.ones(1))
+    assert known(1)[0] @ matrix == pytest.approx(step_rad)
+    for period_px, seen_px in ((15.0, 15.0), (20.0, 20.0), (60.0, 20.9), (5.0, 11.6)):
+        warp = Warp.to_periods(steps * (15.0 / period_px), signs)
+        assert warp.period_px == pytest.approx(seen_px, rel=0.01)
+        assert warp.needed == (period_px != seen_px)
 
 
 def test_settings_are_drawn_again_the_same_and_of_their_split() -> None:
