@@ -293,9 +293,9 @@ def checked(answer: Answer, size: tuple[int, int], where: object) -> Answer:
             f"{where}: answer gave {type(answer).__name__}, expected Answer(depth)"
         )
     for values in (answer.depth, *([] if answer.sigma_mm is None else [answer.sigma_mm])):
-        found = f"{getattr(values, 'dtype', type(values).__name__)} {np.shape(values)}"
-        if found != (expected := f"float32 {size}"):
-            raise PredictionError(f"{where}: the method gave {found}, expected {expected}")
+        actual = f"{getattr(values, 'dtype', type(values).__name__)} {np.shape(values)}"
+        if actual != (expected := f"float32 {size}"):
+            raise PredictionError(f"{where}: the method gave {actual}, expected {expected}")
         if not np.isfinite(values).all():
             raise PredictionError(
                 f"{where}: the method gave values that are not finite: a fault of the method"

@@ -86,17 +86,17 @@ def another_reading(what: str, glances: Sequence[Glance]) -> str | None:
         return None
     _, given, true, along = map(np.array, zip(*glances, strict=True))
     error_mm, inside = _error_mm(given, true), object_mask(true)
-    found = _error_mm(given / along, true), "as distances along the ray"
-    if found[0] >= _RAY_GAIN * error_mm or not _grows_along(given, true, along):
+    reading = _error_mm(given / along, true), "as distances along the ray"
+    if reading[0] >= _RAY_GAIN * error_mm or not _grows_along(given, true, along):
         constant_mm = _error_mm(np.full_like(true, np.median(true[inside])), true)
         if error_mm <= constant_mm:
             return None
-        found = min(*_readings(given[:_FEW], true[:_FEW], constant_mm), _exchanged(glances))
-        if found[0] * _FEWER > error_mm:
+        reading = min(*_readings(given[:_FEW], true[:_FEW], constant_mm), _exchanged(glances))
+        if reading[0] * _FEWER > error_mm:
             return None
     return (
-        f"another reading fits {what} far better: {found[1]}, with a mean error of {found[0]:.3g} "
-        f"mm, not "
+        f"another reading fits {what} far better: {reading[1]}, with a mean error of "
+        f"{reading[0]:.3g} mm, not "
         f"{error_mm:.4g} mm; write depth in mm along the camera's axis, rows from the top, by each "
         f"sample's name"
     )

@@ -148,26 +148,26 @@ class Line:
 
     def error(self, key: str) -> float | None:
         """A score, mean over the seeds; None where it is unknown."""
-        values = [_errors(found).get(key) for found in self.found.values()]
+        values = [_errors(result).get(key) for result in self.found.values()]
         known = [value for value in values if value is not None]
         return statistics.fmean(known) if known else None
 
     @property
     def by_seed(self) -> dict[int, dict[str, float]]:
         """The object MAE in mm of each object, for each seed."""
-        return {seed: _by_object(found) for seed, found in self.found.items()}
+        return {seed: _by_object(result) for seed, result in self.found.items()}
 
 
-def _errors(found: Row | Scores) -> Errors:
-    return found.errors if isinstance(found, Scores) else found.metrics.model_dump()
+def _errors(result: Row | Scores) -> Errors:
+    return result.errors if isinstance(result, Scores) else result.metrics.model_dump()
 
 
-def _by_object(found: Row | Scores) -> dict[str, float]:
-    if isinstance(found, Scores):
-        return dict(found.per_object)
+def _by_object(result: Row | Scores) -> dict[str, float]:
+    if isinstance(result, Scores):
+        return dict(result.per_object)
     return {
         part.object: value
-        for part in found.per_object
+        for part in result.per_object
         if (value := getattr(part, MAIN_KEY)) is not None
     }
 
@@ -193,17 +193,19 @@ def table_lines(
         label, paper_mm = (
             (paper.label, paper.errors_mm) if paper else (_NOT_IN_THE_PAPER.get(row, row), None)
         )
-        weights = {one.seed: _weights_sha256(one, folders, opened) for one in recipes}
+        weights = {
+            training.seed: _weights_sha256(training, folders, opened) for training in recipes
+        }
         entries = {
-            one.seed: held
-            for one in recipes
-            if (sha256 := weights[one.seed]) is not None
-            if (held := row_that_holds(folders.row(one), opened, sha256)) is not None
+            training.seed: held
+            for training in recipes
+            if (sha256 := weights[training.seed]) is not None
+            if (held := row_that_holds(folders.row(training), opened, sha256)) is not None
         }
         entry = entries.get(recipe.seed)
-        found = {seed: held.row for seed, held in entries.items()} if entry is not None else {}
+        by_seed = {seed: held.row for seed, held in entries.items()} if entry is not None else {}
         if table != "multi_frame" or recipe.frames == "single_shot" or weights[recipe.seed] is None:
-            lines.append(Line(row, label, recipe, found, entry, paper_mm))
+            lines.append(Line(row, label, recipe, by_seed, entry, paper_mm))
             continue
         every = scores_that_hold(
             folders.scores(recipe), opened.fingerprint, recipe, weights[recipe.seed]
@@ -211,7 +213,7 @@ def table_lines(
         lines.append(
             Line(row, label, recipe, {recipe.seed: every} if every else {}, entry, paper_mm)
         )
-        lines.append(Line(row, f"{label}, its first frame only", recipe, found, entry))
+        lines.append(Line(row, f"{label}, its first frame only", recipe, by_seed, entry))
     return [
         *_trivial_lines({line.entry.row.track for line in lines if line.entry is not None}, opened),
         *lines,
@@ -245,12 +247,12 @@ def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) ->
     part."""
     recipes_of = [job.recipe for job in jobs]
     held = {
-        one.name: scores_that_hold(folders.scores(one), opened.fingerprint, one)
-        for one in recipes_of
+        recipe.name: scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe)
+        for recipe in recipes_of
     }
     names = dict.fromkeys(row for job in jobs for row in job.rows)
-    parts = {one.fold for one in recipes_of} - {
-        one.fold for one in recipes_of if held[one.name] is None
+    parts = {recipe.fold for recipe in recipes_of} - {
+        recipe.fold for recipe in recipes_of if held[recipe.name] is None
     }
     lines = []
     for name in names:
@@ -258,17 +260,17 @@ def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) ->
         paper = _reported(table).get(row)
         recipes = [job.recipe for job in jobs if name in job.rows]
         scores = [
-            one
+            part_scores
             for recipe in recipes
-            if recipe.fold in parts and (one := held[recipe.name]) is not None
+            if recipe.fold in parts and (part_scores := held[recipe.name]) is not None
         ]
-        found = {recipes[0].seed: joined(scores)} if scores else {}
+        by_seed = {recipes[0].seed: joined(scores)} if scores else {}
         label, paper_mm = (f"{paper.label} ({table})", paper.errors_mm) if paper else (name, None)
-        lines.append(Line(name, label, recipes[0], found, None, paper_mm))
+        lines.append(Line(name, label, recipes[0], by_seed, None, paper_mm))
     constants = [
         constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)
     ]
-    if constants and any(one.normalisation == "individual" for one in recipes_of):
+    if constants and any(recipe.normalisation == "individual" for recipe in recipes_of):
         label = "best constant in the given range (trivial)"
         lines.insert(0, Line("constant", label, None, {0: joined(constants)}, None))
     return lines
@@ -332,7 +334,7 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
         for line in lines
         if line.found and line.paper_mm is not None
     ]
-    found = [
+    pairs = [
         (better, worse, worse_mm - better_mm, here)
         for (better_mm, better), (worse_mm, worse) in combinations(
             sorted(compared, key=lambda c: c[0]), 2
@@ -342,7 +344,7 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
     return [
         Ordering(better.label, worse.label, paper_gap_mm, here, p_holm, better.track == worse.track)
         for (better, worse, paper_gap_mm, here), p_holm in zip(
-            found, holm([here.p for *_, here in found]), strict=True
+            pairs, holm([here.p for *_, here in pairs]), strict=True
         )
     ]
 

@@ -234,7 +234,7 @@ class Row(SparseModel):
         ):
             raise ValueError(f"metrics: {problem}")
         if self.protocol_version == protocol.PROTOCOL_VERSION:
-            found = {
+            counts = {
                 p.object: Counts(
                     p.samples,
                     p.object_pixels,
@@ -243,7 +243,7 @@ class Row(SparseModel):
                 )
                 for p in self.per_object
             }
-            check_data(self.dataset, self.target, self.mode, self.submission.units, found)
+            check_data(self.dataset, self.target, self.mode, self.submission.units, counts)
             check_charge(self.charge_mm, self.dataset, self.mode)
         if self.reliance is not None:
             check_reliance(self.reliance, self.submission)

@@ -226,9 +226,10 @@ def differences(row: Row, folder: Path, dataset: DatasetFolder) -> Verified:
     rows = row, Row.model_validate(row_content(scored, digits=None))
     stored, computed = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
     cancelling = 1e-9 * (row.metrics.object_mae_mm or 0.0)
-    found = list(disagreements(stored, computed, cancelling=cancelling, digits=DIGITS))
+    deviations = list(disagreements(stored, computed, cancelling=cancelling, digits=DIGITS))
     return Verified(
-        difference_lines(found, "row"), of_processors(found, dataset.rig.working_range_mm[1])
+        difference_lines(deviations, "row"),
+        of_processors(deviations, dataset.rig.working_range_mm[1]),
     )
 
 

@@ -114,9 +114,9 @@ def capture_picture(
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    found = depth_mm > 0
-    low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)
-    top = float(np.quantile(sigma_mm[found], 0.95)) if found.any() else 1.0
+    valid = depth_mm > 0
+    low, high = np.quantile(depth_mm[valid], (0.005, 0.995)) if valid.any() else (0.0, 1.0)
+    top = float(np.quantile(sigma_mm[valid], 0.95)) if valid.any() else 1.0
     panels: tuple[Panel, ...] = (
         (
             "mean of the frames, grey levels",
@@ -125,10 +125,10 @@ def capture_picture(
             0.0,
             max(float(np.quantile(grey, 0.999)), 1.0),
         ),
-        ("depth, mm", np.where(found, depth_mm, np.nan), DEPTH_COLOURS, low, high),
+        ("depth, mm", np.where(valid, depth_mm, np.nan), DEPTH_COLOURS, low, high),
         (
             "standard uncertainty by noise, mm",
-            np.where(found, sigma_mm, np.nan),
+            np.where(valid, sigma_mm, np.nan),
             SIGMA_COLOURS,
             0.0,
             top,

@@ -130,8 +130,8 @@ def order_free_follows(changes: Sequence[Change]) -> float | None:
 def order_free(changes: Sequence[Change]) -> list[Change]:
     """Changes of phase in rad as chords, for `relative_change`: a whole period is no change."""
     return [
-        Change(2 * np.sin(one.expected / 2), 2 * np.sin(one.actual / 2), one.answered)
-        for one in changes
+        Change(2 * np.sin(change.expected / 2), 2 * np.sin(change.actual / 2), change.answered)
+        for change in changes
     ]
 
 
@@ -342,9 +342,9 @@ def summary(reliance: Reliance) -> str:
 def _draw_scenes(name: str, sample: SampleScenes) -> Figure:
     """One column per scene: captured frame, expected change and actual change."""
     shown = [
-        one
-        for one in sample.variants
-        if one.kind in ("phase", "outline", "projected") and one.amplitude_rad >= 0
+        variant
+        for variant in sample.variants
+        if variant.kind in ("phase", "outline", "projected") and variant.amplitude_rad >= 0
     ]
     seen = np.logical_or.reduce([variant.scene.mask for variant in shown])
     left, top, width, height = cv2.boundingRect(seen.astype(np.uint8))
@@ -366,7 +366,7 @@ def _draw_scenes(name: str, sample: SampleScenes) -> Figure:
     largest = float(np.nanmax(np.abs(changes[0])))
     rows = {"captured": [Picture(frame) for frame in frames]}
     for title, maps in zip(("expected change", "actual change"), changes, strict=True):
-        rows[title] = [Picture(one, ERROR_COLOURS, -largest, largest) for one in maps]
+        rows[title] = [Picture(change_map, ERROR_COLOURS, -largest, largest) for change_map in maps]
     unit = "mm" if sample.in_mm else "of the range"
     title = (
         f"{name}: one thing changed at a time; {sample.direction} phase; blue to red: "

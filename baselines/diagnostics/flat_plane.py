@@ -257,7 +257,7 @@ def draw(shown: Sequence[tuple[Row, NDArray, NDArray]], normalised: bool) -> Fig
     rows = {
         "fringes": [Picture(frame) for frame in frames],
         f"prediction,\n{low:g} to {high:g}\n{unit}": [
-            Picture(one, DEPTH_COLOURS, low, high) for one in predictions
+            Picture(prediction, DEPTH_COLOURS, low, high) for prediction in predictions
         ],
     }
     alt = "Fringes on planes in three outlines, and the predictions"

@@ -100,7 +100,7 @@ class GradCam(Probe):
             )
         protocol = {"samples": len(samples), "seeds": seeds}
         means["planes"] = {
-            one: measure(subject, dataset, [one], seeds, progress)["layers"] for one in PLANES
+            plane: measure(subject, dataset, [plane], seeds, progress)["layers"] for plane in PLANES
         }
         drawn = _draw_heatmaps(subject, dataset, samples)
         return Finding(
@@ -188,7 +188,7 @@ def measure(
     heatmaps with the trained ones."""
     network, untrained = subject.networks()
     networks = [network, *map(untrained, range(seeds))]
-    found: dict[tuple[str, str], dict[int, list[float | None]]] = defaultdict(
+    correlations: dict[tuple[str, str], dict[int, list[float | None]]] = defaultdict(
         lambda: defaultdict(list)
     )
     edges_with_fringes: list[float | None] = []
@@ -202,15 +202,17 @@ def measure(
             for layer in subject.layer_names:
                 for target, reference in {**compared, OWN: own[layer]}.items():
                     column = f"{RANDOM}{target}" if number else target
-                    found[column, layer][number].append(correlation(heat[layer], reference))
+                    correlations[column, layer][number].append(correlation(heat[layer], reference))
         progress(done + 1, len(samples), f"Grad-CAM of {name}")
     objects = [split_sample_name(name)[0] for name in samples]
-    return means_of(found, subject.layer_names, objects) | {
+    return means_of(correlations, subject.layer_names, objects) | {
         "edges_with_fringes": _mean([edges_with_fringes], objects)
     }
 
 
-def means_of(found: Correlations, layers: Sequence[str], objects: Sequence[str]) -> dict[str, Any]:
+def means_of(
+    correlations: Correlations, layers: Sequence[str], objects: Sequence[str]
+) -> dict[str, Any]:
     """For ``diagnose.json``: `Mean` by layer and column, and of all layers, with the paper's ratio,
     correlation with edges over correlation with fringes, None where undefined; those of random
     weights are means over seeds."""
@@ -218,7 +220,8 @@ def means_of(found: Correlations, layers: Sequence[str], objects: Sequence[str])
     def means(names: Sequence[str]) -> dict[str, Any]:
         return {
             column: _mean(
-                [values for layer in names for values in found[column, layer].values()], objects
+                [values for layer in names for values in correlations[column, layer].values()],
+                objects,
             )
             for column in COLUMNS
         }

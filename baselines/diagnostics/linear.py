@@ -134,8 +134,8 @@ class LinearProbing(Probe):
             (UNTRAINED, seed): untrained(seed) for seed in range(seeds)
         }
         targets = {
-            name: one
-            for name, one in LINEAR.items()
+            name: target
+            for name, target in LINEAR.items()
             if subject.direction != "both" or name not in FRINGE
         }
         linear = scores(
@@ -152,7 +152,7 @@ class LinearProbing(Probe):
                 )
             )
         # Each seed of the untrained network costs another forward pass per batch, so there is one.
-        first = {key: one for key, one in networks.items() if key[1] == 0}
+        first = {key: model for key, model in networks.items() if key[1] == 0}
         probes = ConvolutionProbes(subject, dataset, SPATIAL, tick, seeds, epochs)
         spatial = scores(probes.errors(first, train, validation), validation)
         sizes = {"training_samples": len(train), "validation_samples": len(validation)}
@@ -297,9 +297,9 @@ class LinearProbes:
             features = {(CONTROLS, 0, name): reduce(image) for name, image in images.items()}
             for network_key, network in networks.items():
                 layers = self.subject.layers_of(network)
-                found = activations_of(network, layers, fringe, reduce, self.subject.name)
+                by_layer = activations_of(network, layers, fringe, reduce, self.subject.name)
                 features |= {
-                    (*network_key, layer): activations for layer, activations in found.items()
+                    (*network_key, layer): activations for layer, activations in by_layer.items()
                 }
             true = [self.true_maps(name) for name in names]
             yield features, {key: torch.cat([maps[key] for maps in true]) for key in true[0]}
@@ -312,7 +312,8 @@ class LinearProbes:
         direction = "horizontal" if self.subject.direction == "both" else self.subject.direction
         maps = truth(self.dataset.depth_mm(name), self.dataset.rig, direction)
         reduced = {
-            key: self.reduce(torch.from_numpy(one)[None, None], [name]) for key, one in maps.items()
+            key: self.reduce(torch.from_numpy(true_map)[None, None], [name])
+            for key, true_map in maps.items()
         }
         reduced["image"], reduced["object"] = self.masks(reduced["object"])
         return reduced
@@ -353,7 +354,7 @@ class LinearProbes:
 
     def columns(self, name: str) -> list[int]:
         """Places of a target's maps among all."""
-        return [self.maps.index(one) for one in self.targets[name].maps]
+        return [self.maps.index(map_name) for map_name in self.targets[name].maps]
 
     def mean(self, name: str) -> Tensor:
         """Mean (T, 1, 1) of the maps of a target."""
@@ -387,7 +388,7 @@ class LinearProbes:
         errors = {}
         for name, target in self.targets.items():
             maps, mask = (
-                torch.cat([true[one] for one in target.maps], dim=1).double(),
+                torch.cat([true[map_name] for map_name in target.maps], dim=1).double(),
                 true[target.where],
             )
             for (source, seed), predicted in {
@@ -488,12 +489,12 @@ def scores(errors: Errors, validation: Sequence[str]) -> Scores:
         if (network, seed, layer) != MEAN:
             of_seeds[network, layer, target].append(values)
     objects = [split_sample_name(name)[0] for name in validation]
-    found: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
+    by_network: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
     for (network, layer, target), columns in of_seeds.items():
-        found[network].setdefault(layer, {})[target] = score(
+        by_network[network].setdefault(layer, {})[target] = score(
             columns, errors[MEAN, target, 0], objects
         )
-    return found
+    return by_network
 
 
 def score(
@@ -530,7 +531,10 @@ def mean_over(layers: Mapping[str, Mapping[str, Score]], target: str, key: str =
 def summary(linear: Scores, spatial: Scores) -> str:
     """The result in two sentences."""
     edges, depth, on_object = (f"{mean_over(spatial[TRAINED], target):.2f}" for target in SPATIAL)
-    mask = {target: f"{one['r2']:.2f}" for target, one in spatial[CONTROLS][SILHOUETTE].items()}
+    mask = {
+        target: f"{probe_score['r2']:.2f}"
+        for target, probe_score in spatial[CONTROLS][SILHOUETTE].items()
+    }
     text = (
         f"On average over layers R2 is {edges} for edges (from the object's mask alone: "
         f"{mask['edges']}), {depth} for "
@@ -594,11 +598,19 @@ def draw(linear: Scores) -> Figure:
         ):
             scores = [linear[network][layer][target] for layer in layers]
             axes.plot(
-                layers, [one["r2"] for one in scores], style, color=colour, label=label, **LINE
+                layers,
+                [probe_score["r2"] for probe_score in scores],
+                style,
+                color=colour,
+                label=label,
+                **LINE,
             )
-            for layer, one in zip(layers, scores, strict=True):
+            for layer, probe_score in zip(layers, scores, strict=True):
                 axes.plot(
-                    [layer] * len(one[ends] or ()), one[ends] or (), color=colour, linewidth=0.8
+                    [layer] * len(probe_score[ends] or ()),
+                    probe_score[ends] or (),
+                    color=colour,
+                    linewidth=0.8,
                 )
         for (control, label), style in zip(CONTROL_TITLES.items(), (":", "-."), strict=True):
             level = [linear[CONTROLS][control][target]["r2"]] * len(layers)

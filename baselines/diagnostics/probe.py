@@ -216,9 +216,9 @@ def diagnose(
                 results.append(ProbeResult(probe, finding, seconds, reused=False))
         context = _context(subject, dataset, settings, command)
         findings = {
-            one.probe.name: {"seconds": one.seconds, "title": one.probe.title}
-            | {key: getattr(one.finding, key) for key in ("summary", "skipped", "values")}
-            for one in results
+            result.probe.name: {"seconds": result.seconds, "title": result.probe.title}
+            | {key: getattr(result.finding, key) for key in ("summary", "skipped", "values")}
+            for result in results
         }
         content = {
             "format": "fpp-ml-bench diagnosis",

@@ -169,9 +169,9 @@ def network_output(network: nn.Module, batch: Tensor, name: str) -> Depth:
 
 def checked_output(output: Tensor, shape: Sequence[int], name: str) -> Tensor:
     """``output`` as float32 if it is finite and of ``shape``; else `DiagnosisError`."""
-    found, expected = tuple(getattr(output, "shape", ())), tuple(shape)
-    if found != expected:
-        got = found or type(output).__name__
+    output_shape, expected = tuple(getattr(output, "shape", ())), tuple(shape)
+    if output_shape != expected:
+        got = output_shape or type(output).__name__
         raise DiagnosisError(
             f"{name}: expected an output of shape {expected}, one depth per pixel, got {got}"
         )

@@ -122,8 +122,8 @@ def scores_that_hold(
         scores = read_scores(path)
     except SubmissionError:
         return None
-    found = scores.fingerprint, scores.recipe_digest, scores.protocol_version
-    same = found == (fingerprint, recipe.digest, PROTOCOL_VERSION)
+    identity = scores.fingerprint, scores.recipe_digest, scores.protocol_version
+    same = identity == (fingerprint, recipe.digest, PROTOCOL_VERSION)
     return scores if same and weights_sha256 in (None, scores.weights_sha256) else None
 
 

@@ -365,8 +365,8 @@ def _score(
         return
     # A network's method sets torch's threads for the whole process; the next one needs its own.
     with torch_threads(torch.get_num_threads()):
-        told = {"recipe_digest": recipe.digest, **about}
-        method = NetworkMethod(model, remark=f"{recipe.preset} preset", about=told)
+        details = {"recipe_digest": recipe.digest, **about}
+        method = NetworkMethod(model, remark=f"{recipe.preset} preset", about=details)
         settings.leaderboard.check_row_is_of(path, opened)
         result = score_method(opened, method, path, folders)
     settings.leaderboard.write_measured(result, path)

@@ -131,8 +131,8 @@ def measure(
         files = {axis: out / f"{axis}.json" for axis in setup.axes(axes)}
         kept = {axis: read_axis(file, setup.key()) for axis, file in files.items()}
         rows = {axis: content["views"] for axis, content in kept.items() if content is not None}
-        for found in rows.values():
-            progress(len(found))
+        for kept_views in rows.values():
+            progress(len(kept_views))
         missing = [axis for axis in files if axis not in rows]
         frames = FrameCache(cache)
         work = setup.method, setup.conditions(CLEAN)[0], frames, setup.views
@@ -216,8 +216,8 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
             f"robustness is a mean over all axes and severities, and this is {lacking}"
         )
     axes = {
-        axis: [SeverityScores.model_validate(scores) for scores in severity_means(found).values()]
-        for axis, found in rows.items()
+        axis: [SeverityScores.model_validate(scores) for scores in severity_means(views).values()]
+        for axis, views in rows.items()
     }
     (clean,) = axes.pop(CLEAN)
     beside = {
@@ -225,13 +225,13 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         for name, axis in corruptions().axes.items()
         if axis.beside and name in axes
     }
-    found = object_interval(*_shares_of_the_mean({axis: rows[axis] for axis in (CLEAN, *axes)}))
+    interval = object_interval(*_shares_of_the_mean({axis: rows[axis] for axis in (CLEAN, *axes)}))
     every = [scores.mae_mm for severities in axes.values() for scores in severities]
     return Robustness(
         version=corruptions().version,
         set=setup.set_name,
         mae_mm=sum(every) / len(every),
-        interval=[None, None] if found is None else [max(found[0], 0.0), found[1]],
+        interval=[None, None] if interval is None else [max(interval[0], 0.0), interval[1]],
         clean=clean,
         axes=axes,
         beside=beside,
@@ -267,7 +267,7 @@ class Measured:
     def mean(self, key: str = "mae_mm", axis: str | None = None) -> float | None:
         """Mean of a score over the severities of an axis, or of all that count, that were measured;
         None where one is unknown."""
-        counted = (name for name, one in corruptions().axes.items() if not one.beside)
+        counted = (name for name, corruption in corruptions().axes.items() if not corruption.beside)
         axes = set(counted) if axis is None else {axis}
         values = [
             scores[key] for name, by in self.means.items() if name in axes for scores in by.values()
@@ -277,14 +277,14 @@ class Measured:
 
 def read_measured(out: Path) -> list[Measured]:
     """Every method below ``out``, the best first. PredictionError for a damaged file."""
-    found = []
+    measured = []
     for folder in sorted(path for path in out.iterdir() if path.is_dir()):
         files = [folder / f"{axis}.json" for axis in (CLEAN, *corruptions().axes)]
         contents = [content for file in files if (content := read_axis(file)) is not None]
         if contents:
             means = {content["axis"]: severity_means(content["views"]) for content in contents}
-            found.append(Measured(folder, contents[0]["setup"], means))
-    return sorted(found, key=lambda one: (one.mean() is None, one.mean() or 0.0))
+            measured.append(Measured(folder, contents[0]["setup"], means))
+    return sorted(measured, key=lambda method: (method.mean() is None, method.mean() or 0.0))
 
 
 def write_page(out: Path) -> Path:
@@ -313,16 +313,16 @@ def draw_curves(measured: Sequence[Measured]) -> bytes:
     axes = {
         name: axis
         for name, axis in rules.axes.items()
-        if any(name in one.means for one in measured)
+        if any(name in method.means for method in measured)
     }
     drawn, panels_of = panels([f"{name}, {axis.unit}" for name, axis in axes.items()], 4, 3.3, 2.9)
     for panel, (name, axis) in zip(panels_of, axes.items(), strict=True):
-        for number, one in enumerate(measured):
-            if name not in one.means:
+        for number, method in enumerate(measured):
+            if name not in method.means:
                 continue
-            points = {0: one.means.get(CLEAN, {}).get(0, {}), **one.means[name]}
-            label = one.setup["title"] + (", unseen" if one.setup["set"] == "unseen" else "")
-            label += " (quick)" if one.setup["quick"] else ""
+            points = {0: method.means.get(CLEAN, {}).get(0, {}), **method.means[name]}
+            label = method.setup["title"] + (", unseen" if method.setup["set"] == "unseen" else "")
+            label += " (quick)" if method.setup["quick"] else ""
             style = "o" + _DASHES[number // len(LINE_COLOURS) % len(_DASHES)]
             errors = np.array([scores.get("mae_mm") for scores in points.values()], dtype=float)
             colour = LINE_COLOURS[number % len(LINE_COLOURS)]

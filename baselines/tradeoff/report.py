@@ -248,7 +248,7 @@ class Scatter:
             groups[f"label-{mark.number}"] = f'<g class="name"{row}>'
         content = text.getvalue()
         content = content[content.index("<g ") : content.rindex("</g>") + len("</g>")]
-        content = re.sub(r"<[^>]*>", lambda found: _for_page(found[0], groups), content)
+        content = re.sub(r"<[^>]*>", lambda match: _for_page(match[0], groups), content)
         content = re.sub(r"\s*\n\s*", " ", content)
         head = f'<svg class="{css}" viewBox="0 0 {width} {height}" role="img" aria-label="{escaped(about, 5000)}">'
         return f"{head}{content}</svg>", numbered

@@ -354,11 +354,11 @@ def _header(path: Path) -> dict[str, Any]:
             raise ValueError(f"a header of {length} bytes, found {len(header)}")
         described = strict_json(header.decode("utf-8"))
         metadata = described.pop("__metadata__", {})
-        told = (
+        stated_size = (
             8 + length + max((entry["data_offsets"][1] for entry in described.values()), default=0)
         )
-        if told != size or not isinstance(metadata, dict):
-            raise ValueError(f"its header tells of {told} bytes, it has {size}")
+        if stated_size != size or not isinstance(metadata, dict):
+            raise ValueError(f"its header tells of {stated_size} bytes, it has {size}")
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise _fault(
             path,

@@ -117,8 +117,8 @@ def _check_same_data(first: Result, second: Result) -> None:
         lines.append(f"dataset: {printable(a.identity)} against {printable(b.identity)}")
     rules = {"split": "dataset.split", "target": "target", "track": "track", "mode": "mode"}
     for title, key in {**rules, "protocol": "protocol_version"}.items():
-        one, other = attrgetter(key)(first), attrgetter(key)(second)
-        lines += [f"{title}: {one} against {other}"] if one != other else []
+        value, other = attrgetter(key)(first), attrgetter(key)(second)
+        lines += [f"{title}: {value} against {other}"] if value != other else []
     samples = [
         sorted((row.sample, row.object_pixels) for row in result.per_sample)
         for result in (first, second)

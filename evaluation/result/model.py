@@ -139,7 +139,7 @@ class Result(SparseModel, _Scores, _Rules):
         objects: dict[str, list[SampleResult]] = {}
         for row in self.per_sample:
             objects.setdefault(row.object, []).append(row)
-        found = {
+        counts = {
             name: Counts(
                 len(rows),
                 sum(r.object_pixels for r in rows),
@@ -148,7 +148,7 @@ class Result(SparseModel, _Scores, _Rules):
             )
             for name, rows in objects.items()
         }
-        check_data(self.dataset, self.target, self.mode, self.submission.units, found)
+        check_data(self.dataset, self.target, self.mode, self.submission.units, counts)
         check_charge(self.charge_mm, self.dataset, self.mode)
         void = self.mode == "standard"
         for row in self.per_sample:
@@ -283,10 +283,10 @@ def _check_sample(
 
 
 def check_data(
-    data: parts.DatasetInfo, target: str, mode: str, units: str, found: Mapping[str, Counts]
+    data: parts.DatasetInfo, target: str, mode: str, units: str, file_counts: Mapping[str, Counts]
 ) -> None:
     """Refuse (ValueError) a content of other columns than the rules read, and a named benchmark
-    whose samples, objects or pixels are others than those ``found`` in a file."""
+    whose samples, objects or pixels are others than ``file_counts``, those of a file."""
     splits = {name.partition("/")[0] for name in data.content}
     expected = [
         {f"{split}/{column}" for split in splits for column in scored_columns(target, mode, flags)}
@@ -301,8 +301,10 @@ def check_data(
         "paper",
         "normalised",
     ):  # whose mask lacks the object's nearest pixels (`scored_pair`)
-        found = {name: counts._replace(object_px=None) for name, counts in found.items()}
-    if problem := known_problem(data.content, data.split, target, mode, found):
+        file_counts = {
+            name: counts._replace(object_px=None) for name, counts in file_counts.items()
+        }
+    if problem := known_problem(data.content, data.split, target, mode, file_counts):
         raise ValueError(problem)
 
 

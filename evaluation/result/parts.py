@@ -289,8 +289,8 @@ class DatasetInfo(SparseModel):
             return self
         claim, actual = f"{self.benchmark.name} version {self.benchmark.version}", self.known
         if actual is None or claim != actual.title:
-            found = f"is that of {actual.title}" if actual else "is not that benchmark's"
-            raise ValueError(f"benchmark says {claim}, but content {found}")
+            verdict = f"is that of {actual.title}" if actual else "is not that benchmark's"
+            raise ValueError(f"benchmark says {claim}, but content {verdict}")
         return self
 
     @property

@@ -245,11 +245,11 @@ def _scored(
             bad = "NaN, infinite or negative values"
             raise DatasetError(f"{sample}: the target depth holds {bad}; run: fpp-bench verify")
         reach_mm = dataset.rig.working_range_mm[1] if high else 0.0
-        found = read_prediction(listing, read, sample, rules.units, target, reach_mm, void)
-        problems, outcome = found.problems, None
+        prediction = read_prediction(listing, read, sample, rules.units, target, reach_mm, void)
+        problems, outcome = prediction.problems, None
         if not problems:
             with dataset_lock:
-                pair = rules.pair(found.values, dataset, sample)
+                pair = rules.pair(prediction.values, dataset, sample)
             charge_mm = rules.charge_mm(dataset.rig)
             try:
                 scores = score_sample(*pair, edge_band_px, void, unlit_mm, charge_mm)
@@ -258,8 +258,8 @@ def _scored(
             else:
                 stated = (
                     None
-                    if found.sigma_mm is None
-                    else score_sigma(*pair, found.sigma_mm, void, charge_mm)
+                    if prediction.sigma_mm is None
+                    else score_sigma(*pair, prediction.sigma_mm, void, charge_mm)
                 )
                 hashes = {column: image_hash(image) for column, image in scored_on.items()}
                 seen = (
@@ -267,7 +267,7 @@ def _scored(
                     if sample in glanced_at
                     else None
                 )
-                row = _row(scores, found.digest)
+                row = _row(scores, prediction.digest)
                 outcome = Scored(sample, split_sample_name(sample)[0], row, stated, hashes, seen)
         with dataset_lock:
             dataset.release(sample)

@@ -87,50 +87,53 @@ def differences(scored: Result, folder: Any, dataset: DatasetFolder) -> Verified
         {row["sample"]: row for row in part.pop("per_sample")} for part in (stored, computed)
     )
     block, again_block = (part.pop("uncertainty", None) for part in (stored, computed))
-    found = list(disagreements(stored, computed))
+    deviations = list(disagreements(stored, computed))
     if rows.keys() != again_rows.keys():
-        return Verified([*difference_lines(found), "per_sample: other samples than the split has"])
+        return Verified(
+            [*difference_lines(deviations), "per_sample: other samples than the split has"]
+        )
     for sample, row in again_rows.items():
         differing = disagreements(
             rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0)
         )
         # Other predictions explain all the rest.
         first = sorted(differing, key=lambda difference: difference[0] not in _HASHES)
-        found += [(f"{sample}: {name}", *pair) for name, *pair in first]
+        deviations += [(f"{sample}: {name}", *pair) for name, *pair in first]
     if (block is None) != (again_block is None):
         said = [
             "there is none" if part is None else "there is one" for part in (block, again_block)
         ]
         return Verified(
             [
-                *difference_lines(found),
+                *difference_lines(deviations),
                 f"uncertainty: {said[0]} in the result, {said[1]} recomputed",
             ]
         )
-    found += disagreements(block, again_block, "uncertainty", rounding=1e-12)  # nll is near 0
+    deviations += disagreements(block, again_block, "uncertainty", rounding=1e-12)  # nll is near 0
     means = [
         (f"metrics.{key}", *(getattr(result.metrics, key) for result in (scored, again)))
         for key in RANKED
     ]
     means = [difference for difference in means if difference[1] is not None]
     return Verified(
-        difference_lines(found), of_processors([*found, *means], dataset.rig.working_range_mm[1])
+        difference_lines(deviations),
+        of_processors([*deviations, *means], dataset.rig.working_range_mm[1]),
     )
 
 
-def of_processors(found: Sequence[Difference], far_mm: float) -> bool:
+def of_processors(deviations: Sequence[Difference], far_mm: float) -> bool:
     """Whether the differences of a result or row are hashes of predictions, and scores that differ
     by no more than `PROCESSOR_ERROR` and what `PROCESSOR_PIXELS` can change, ``far_mm`` each; means
     by `PROCESSOR_MEAN_PIXELS`. Scores that differ where the predictions do not are no work of a
     processor."""
-    changed = {_place(name) for name, *_ in found if name.split(": ")[-1] in _HASHES}
+    changed = {_place(name) for name, *_ in deviations if name.split(": ")[-1] in _HASHES}
     return bool(changed) and all(
         name.split(": ")[-1] in _HASHES
         or (
             (": " not in name or _place(name) in changed)
             and _within(name, stored, computed, far_mm)
         )
-        for name, stored, computed in found
+        for name, stored, computed in deviations
     )
 
 
@@ -165,12 +168,12 @@ def _within(name: str, stored: Any, computed: Any, far_mm: float) -> bool:
     return bool(abs(stored - computed) <= PROCESSOR_ERROR * abs(stored) + pixels * cost)
 
 
-def difference_lines(found: Iterable[Difference], file: str = "result") -> list[str]:
+def difference_lines(deviations: Iterable[Difference], file: str = "result") -> list[str]:
     """The `disagreements` of a ``file``, a line each."""
     return [
         f"{name}: {_value_text(stored)} in the {file}, {_value_text(value)} "
         + (f"in {SUBMISSION_FILE}" if name.startswith("submission.") else "recomputed")
-        for name, stored, value in found
+        for name, stored, value in deviations
     ]
 
 

@@ -40,10 +40,10 @@ def read_plain(folder: Path) -> dict[Any, Any]:
     SubmissionError."""
     path = folder / SUBMISSION_FILE
     if path.is_symlink() or not path.is_file():
-        found = "a symbolic link" if path.is_symlink() else "none"
+        actual = "a symbolic link" if path.is_symlink() else "none"
         raise SubmissionError(
             f"expected a file {printable(str(path), 500)} that describes the predictions, found "
-            f"{found}; fpp-bench "
+            f"{actual}; fpp-bench "
             "predict writes one, PROTOCOL.md lists its keys"
         )
     return read_plain_file(path, "'name: My method'")
@@ -129,9 +129,9 @@ class Listing:
         low, high = float(sigma_mm.min()), float(sigma_mm.max())
         if low >= 0 and high <= LARGEST_MM:  # False for NaN
             return sigma_mm
-        found = f"found {low:g} to {high:g}"
+        actual = f"found {low:g} to {high:g}"
         raise PredictionError(
-            f"expected finite mm of 0 and more, {found}; write 0 where none is stated"
+            f"expected finite mm of 0 and more, {actual}; write 0 where none is stated"
         )
 
 

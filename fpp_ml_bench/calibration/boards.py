@@ -143,12 +143,12 @@ class Board:
         size = (self.columns, self.rows)
         accurate = cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_ACCURACY
         for flags in (accurate, accurate + cv2.CALIB_CB_EXHAUSTIVE):
-            found, corners = cv2.findChessboardCornersSB(stretched, size, flags=flags)
-            if found:
+            detected, corners = cv2.findChessboardCornersSB(stretched, size, flags=flags)
+            if detected:
                 return _refined(image, corners)
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, corners = cv2.findChessboardCorners(stretched, size, flags=flags)
-        return _refined(image, corners) if found else None
+        detected, corners = cv2.findChessboardCorners(stretched, size, flags=flags)
+        return _refined(image, corners) if detected else None
 
     def _part(self, stretched: NDArray[np.uint8]) -> tuple[str, NDArray[np.float64]]:
         """The largest part of a checker that is seen, in words, and its corners (n, 2) px."""
@@ -157,8 +157,8 @@ class Board:
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_EXHAUSTIVE + cv2.CALIB_CB_LARGER
         for share in SEEDS:
             seed = [max(3, int(np.ceil(share * count))) for count in (self.columns, self.rows)]
-            found, corners, grid = cv2.findChessboardCornersSBWithMeta(image, seed, flags)
-            if found:
+            detected, corners, grid = cv2.findChessboardCornersSBWithMeta(image, seed, flags)
+            if detected:
                 columns, rows = sorted(
                     grid.shape, reverse=self.columns > self.rows
                 )  # OpenCV may have turned it
@@ -185,10 +185,10 @@ class Board:
         size, detector = (self.columns, self.rows), self._blob_detector(image.size)
         for picture in (stretched, 255 - stretched):
             for clustering in (0, cv2.CALIB_CB_CLUSTERING):
-                found, centres = cv2.findCirclesGrid(
+                detected, centres = cv2.findCirclesGrid(
                     picture, size, flags=flags + clustering, blobDetector=detector
                 )
-                if found:
+                if detected:
                     return centres
         return None
 
@@ -209,10 +209,10 @@ class Board:
         ):  # with an even number of rows, OpenCV's markers lay on the other squares
             board = cv2.aruco.CharucoBoard(squares, self.spacing_mm, self.detail_mm, dictionary)
             board.setLegacyPattern(before_4_6)
-            found, labels, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(stretched)
+            detected_px, labels, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(stretched)
             if labels is not None and len(labels) > most:
                 most, corners[:] = len(labels), np.nan
-                corners[np.ravel(labels)] = _refined(image, found).reshape(-1, 2)
+                corners[np.ravel(labels)] = _refined(image, detected_px).reshape(-1, 2)
         return corners if most >= FEWEST_CORNERS else None
 
     def _markers(self, stretched: NDArray[np.uint8]) -> tuple[str, NDArray[np.float64]]:

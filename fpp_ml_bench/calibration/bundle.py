@@ -192,7 +192,7 @@ class Bundle:
                 f"{len(poses)} poses give too few points for {none.size} unknowns: capture more"
             )
         try:
-            found = least_squares(
+            solution = least_squares(
                 lambda step: system(step.tobytes())[0],
                 none,
                 lambda step: system(step.tobytes())[1],
@@ -207,7 +207,7 @@ class Bundle:
             raise CalibrationError(
                 f"the fit of the rig failed ({error}): look at the poses"
             ) from error
-        return start + free @ found.x
+        return start + free @ solution.x
 
     def spread(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """A root (p, f) of the covariance of all p parameters at the solution ``x``: the covariance

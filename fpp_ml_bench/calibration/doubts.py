@@ -85,19 +85,19 @@ CAUSES: tuple[tuple[str, str, *tuple[int, ...]], ...] = (
 
 
 def doubts(
-    found: Calibration, bundle: Bundle, x: NDArray[np.float64], root: NDArray[np.float64]
+    calibration: Calibration, bundle: Bundle, x: NDArray[np.float64], root: NDArray[np.float64]
 ) -> Iterator[str]:
-    """What is improbable about the calibration ``found`` at the solution ``x`` of ``bundle``, a
-    sentence each; ``root``: `Bundle.spread` there."""
-    if text := _cause(bundle, x) or _error(found):
+    """What is improbable about ``calibration`` at the solution ``x`` of ``bundle``, a sentence
+    each; ``root``: `Bundle.spread` there."""
+    if text := _cause(bundle, x) or _error(calibration):
         yield f"warning: {text}"
-    board_mm = float(np.ptp(found.board_mm, axis=0).max())
-    figures = [("baseline in mm", found.baseline_mm, *BASELINES_MM, SPACING)]
+    board_mm = float(np.ptp(calibration.board_mm, axis=0).max())
+    figures = [("baseline in mm", calibration.baseline_mm, *BASELINES_MM, SPACING)]
     figures.append(("board's longer side in mm", board_mm, *BOARDS_MM, SPACING))
     for place, (name, part) in enumerate(
         (("camera", bundle.camera), ("projector", bundle.projector))
     ):
-        device = (found.camera, found.projector)[place]
+        device = (calibration.camera, calibration.projector)[place]
         lens = device.pinhole
         sides = np.array([lens.width, lens.height])
         aspect = lens.fx / lens.fy
@@ -109,7 +109,7 @@ def doubts(
         farthest = LARGEST_OFFSETS[place] + SIGMAS * float(
             (np.array(device.sigma[2:4]) / sides).max()
         )
-        measured = np.concatenate([pose.measured_px[place] for pose in found.poses])
+        measured = np.concatenate([pose.measured_px[place] for pose in calibration.poses])
         shown, ideal = (
             ((measured - lens.centre) / lens.focal).T,
             np.stack(lens.normalised(*measured.T)),
@@ -163,14 +163,14 @@ def _cause(bundle: Bundle, x: NDArray[np.float64]) -> str | None:
     return None
 
 
-def _error(found: Calibration) -> str | None:
+def _error(calibration: Calibration) -> str | None:
     """A sentence on an error that is too large, of the two devices together or of one of them, or
     None."""
-    rms, alone = found.rms_px, found.alone_rms_px
-    finer = max(1.0, found.projector.pinhole.fx / found.camera.pinhole.fx)
+    rms, alone = calibration.rms_px, calibration.alone_rms_px
+    finer = max(1.0, calibration.projector.pinhole.fx / calibration.camera.pinhole.fx)
     figures = f"RMS {rms.camera:.3f} px in the camera, {rms.projector:.3f} px in the projector"
     if any(px > LARGEST_RATIO * own + CALIBRATED_PX for px, own in zip(rms, alone, strict=False)):
-        worst = max(found.poses, key=lambda pose: pose.rms_px.both)
+        worst = max(calibration.poses, key=lambda pose: pose.rms_px.both)
         return (
             f"camera and projector fit alone ({alone[0]:.3f} and {alone[1]:.3f} px), but not "
             f"together ({figures}). "

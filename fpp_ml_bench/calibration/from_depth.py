@@ -175,7 +175,7 @@ def _with_middle(
 
 def _rounded(
     fit: Callable[..., Projector],
-    found: Projector,
+    projector: Projector,
     size: tuple[int, int],
     centre: Set[str] = frozenset(),
 ) -> tuple[Projector, str]:
@@ -183,15 +183,17 @@ def _rounded(
     say so."""
     pitches, words, certain = {}, [], True
     for name, length in zip(("pitch_u", "pitch_v"), size, strict=True):
-        if whole := _whole_pitch(found.values[name], found.errors[name], length):
+        if whole := _whole_pitch(projector.values[name], projector.errors[name], length):
             pitches[name], title = whole
             words.append(title)
-            certain &= abs(pitches[name] - found.values[name]) <= _SIGMAS * found.errors[name]
+            certain &= (
+                abs(pitches[name] - projector.values[name]) <= _SIGMAS * projector.errors[name]
+            )
     if not pitches:
-        return found, ""
-    fitted = fit(found.values | pitches, {"focal"}, centre, PITCH - pitches.keys())
-    if not certain and fitted.sigma_px > _MOST_WORSE * found.sigma_px + _WORSE_PX:
-        return found, ""
+        return projector, ""
+    fitted = fit(projector.values | pitches, {"focal"}, centre, PITCH - pitches.keys())
+    if not certain and fitted.sigma_px > _MOST_WORSE * projector.sigma_px + _WORSE_PX:
+        return projector, ""
     return fitted, "; rounded to " + " and ".join(dict.fromkeys(words))
 
 
@@ -220,7 +222,7 @@ def _values(start: Projection, pitch_px: Pair | NDArray[np.float64]) -> dict[str
     return dict(zip(NAMES, numbers.tolist(), strict=True))
 
 
-def _check_fit(found: Projector, first: Projector) -> None:
+def _check_fit(projector: Projector, first: Projector) -> None:
     for name in ("pitch_u", "pitch_v", "focal"):
         value, error = first.values[name], first.errors.get(name, 0.0)
         if not error <= MOST_RELATIVE_ERROR * abs(value):
@@ -229,9 +231,9 @@ def _check_fit(found: Projector, first: Projector) -> None:
                 f"{value:.2f} +- {error:.2g} "
                 "px; give views at more places and distances, or the pitch"
             )
-    if not found.sigma_px <= MOST_SIGMA_PX:
+    if not projector.sigma_px <= MOST_SIGMA_PX:
         raise CalibrationError(
-            f"the best projector misses the phases by {found.sigma_px:.2f} px (robust standard "
+            f"the best projector misses the phases by {projector.sigma_px:.2f} px (robust standard "
             f"deviation), expected at "
             f"most {MOST_SIGMA_PX} px: the depth is not that of these frames, or not by this "
             f"camera; check both, and "
@@ -240,25 +242,25 @@ def _check_fit(found: Projector, first: Projector) -> None:
 
 
 def _rig_of(
-    found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArray[np.float64]
+    projector: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArray[np.float64]
 ) -> Rig:
     """``rig`` with the projector found, its distances widened to hold ``depths_mm``."""
-    focal, aspect = found.pair("focal", "aspect")
-    c_u, c_v = found.pair("c_u", "c_v")
+    focal, aspect = projector.pair("focal", "aspect")
+    c_u, c_v = projector.pair("c_u", "c_v")
     high_mm, low_mm = np.percentile(depths_mm, _LEVELS).tolist()
     near = min(rig.working_range_mm[0], _STEP_MM * math.floor(low_mm / _STEP_MM - 1))
     far = max(rig.working_range_mm[1], _STEP_MM * math.ceil(high_mm / _STEP_MM + 1))
-    turn, (x, y, z) = ([found.values[name] for name in NAMES[at : at + 3]] for at in (0, 3))
+    turn, (x, y, z) = ([projector.values[name] for name in NAMES[at : at + 3]] for at in (0, 3))
     try:
         return replace(
             rig,
             projector=Pinhole(
-                *size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)
+                *size, focal, focal * aspect, c_u, c_v, (projector.values["k1"], 0.0, 0.0, 0.0, 0.0)
             ),
             rotation=tuple(map(tuple, rotation_matrix(tuple(turn)).tolist())),
             translation_m=(x, y, z),
-            pitch_vertical_px=found.values["pitch_u"],
-            pitch_horizontal_px=found.values["pitch_v"],
+            pitch_vertical_px=projector.values["pitch_u"],
+            pitch_horizontal_px=projector.values["pitch_v"],
             working_range_mm=(near, far),
             background_m=max(rig.background_m, far / MM_PER_M + _BEHIND_M),
         )

@@ -276,8 +276,8 @@ def fit_response(measured: Sequence[Levels]) -> Response | None:
     def misfit(gamma: float) -> float:
         return sum(_response_residuals(pose, gamma)[0] for pose in measured)
 
-    found = minimize_scalar(misfit, bounds=GAMMAS, method="bounded", options={"xatol": 1e-5})
-    gamma, least = float(found.x), float(found.fun)
+    minimum = minimize_scalar(misfit, bounds=GAMMAS, method="bounded", options={"xatol": 1e-5})
+    gamma, least = float(minimum.x), float(minimum.fun)
     count = sum(pose.grey.size - 2 * pose.grey.shape[1] for pose in measured)
     step = 1e-2
     curvature = (misfit(gamma + step) - 2 * least + misfit(gamma - step)) / step**2

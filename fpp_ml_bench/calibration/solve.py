@@ -171,8 +171,8 @@ def calibrate(
     root = bundle.spread(x)
     check_solution(bundle, x, np.linalg.norm(root, axis=1))
     held_out = _held_out(bundle, x) if hold_out and len(poses) > 3 else [float("nan")] * len(poses)
-    found = _result(bundle, x, root, alone, held_out, board, sizes, baseline_mm)
-    return replace(found, doubts=tuple(doubts(found, bundle, x, root)))
+    calibration = _result(bundle, x, root, alone, held_out, board, sizes, baseline_mm)
+    return replace(calibration, doubts=tuple(doubts(calibration, bundle, x, root)))
 
 
 def _without_circle_bias(

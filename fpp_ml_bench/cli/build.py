@@ -131,7 +131,7 @@ def settings_of(given: BuildCommandSettings) -> "BuildSettings":
         light = light.changed("camera", **camera_noise(given.noise_sigma))
     if given.shadows:
         light = light.changed("bounces", shadows=True)
-    found = None if given.decode_with is None else load_rig(given.decode_with)
+    decoding_rig = None if given.decode_with is None else load_rig(given.decode_with)
     stored = given.config or default_frames(given.rig)
     scale = given.object_scale
     if scale is None:
@@ -143,7 +143,7 @@ def settings_of(given: BuildCommandSettings) -> "BuildSettings":
             "projector", focus_m=middle if given.light in NAMED_LIGHTS else own_focus_m
         )
     return BuildSettings(
-        rig, everything, given.placement, stored, given.seed, light, own, found, scale
+        rig, everything, given.placement, stored, given.seed, light, own, decoding_rig, scale
     )
 
 

@@ -219,8 +219,8 @@ def _virtual(settings: CalibrateSettings, folder: Path) -> None:
     poses = board_poses(true_rig, board, settings.poses or BOARD_POSES)
     with progress_bar("photographing", len(poses) * len(true_rig.sequence), "images") as advance:
         photograph_board(folder, true_rig, board, poses, progress=advance)
-    found = _from_board(settings, folder, board, folder / "rig.yaml", true_rig)
-    error = volume_error_mm(found, true_rig)
+    rig = _from_board(settings, folder, board, folder / "rig.yaml", true_rig)
+    error = volume_error_mm(rig, true_rig)
     print(
         f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, "
         f"{error.worst_mm:.3f} mm at most, "
@@ -279,21 +279,21 @@ def _from_board(
         "baseline_mm": settings.baseline,
     }
     with progress_bar("fitting", len(lenses), "lens models") as advance:
-        found = []
+        calibrations = []
         for lens in lenses:
-            found.append(calibrate_rig(poses, board, *sizes, lens, **options))
+            calibrations.append(calibrate_rig(poses, board, *sizes, lens, **options))
             advance(1)
-    if len(found) > 1:
+    if len(calibrations) > 1:
         compared = Table("lens model", numbers=("RMS, px", "left out, px", "BIC"))
-        for one in found:
+        for calibration in calibrations:
             compared.add_row(
-                str(one.camera.lens),
-                f"{one.rms_px.both:.4f}",
-                f"{one.held_out_rms_px:.4f}",
-                f"{one.bic:.0f}",
+                str(calibration.camera.lens),
+                f"{calibration.rms_px.both:.4f}",
+                f"{calibration.held_out_rms_px:.4f}",
+                f"{calibration.bic:.0f}",
             )
         show(compared)
-    best = min(found, key=lambda one: one.held_out_rms_px)
+    best = min(calibrations, key=lambda calibration: calibration.held_out_rms_px)
     rig = calibrated_rig(
         best, rig, settings.working_range or (like.working_range_mm if like else None)
     )
@@ -337,40 +337,41 @@ def _four_digits(error_px: float) -> str:
     return "-" if isnan(error_px) else f"{error_px:.4f}"
 
 
-def print_calibration(found: "Calibration") -> None:
+def print_calibration(calibration: "Calibration") -> None:
     """Print the errors of every pose, and the rig with its standard uncertainties."""
     columns = "camera", "projector", "both", "left out"
     table = Table("", numbers=columns, title="reprojection error (RMS, px; no point rejected)")
-    for pose in found.poses:
+    for pose in calibration.poses:
         errors = (*pose.rms_px, pose.held_out_rms_px)
-        named = f"{pose.name} (!)" if pose.name in found.spoilers else pose.name
-        table.add_row(named, *map(_four_digits, errors), end_section=pose is found.poses[-1])
-    table.add_row("all", *map(_four_digits, (*found.rms_px, found.held_out_rms_px)))
+        named = f"{pose.name} (!)" if pose.name in calibration.spoilers else pose.name
+        table.add_row(named, *map(_four_digits, errors), end_section=pose is calibration.poses[-1])
+    table.add_row("all", *map(_four_digits, (*calibration.rms_px, calibration.held_out_rms_px)))
     show(table)
-    for doubt in found.doubts:
+    for doubt in calibration.doubts:
         print(doubt, file=sys.stderr)
-    if isnan(found.held_out_rms_px):
+    if isnan(calibration.held_out_rms_px):
         few = (
-            f"{len(found.poses)} poses: none can be left out to compare lens models or to find a "
-            f"bad pose"
+            f"{len(calibration.poses)} poses: none can be left out to compare lens models or to "
+            f"find a bad pose"
         )
         print(
-            f"note: {few}; the lens is {found.camera.lens}. Capture four or more", file=sys.stderr
+            f"note: {few}; the lens is {calibration.camera.lens}. Capture four or more",
+            file=sys.stderr,
         )
-    if found.spoilers:
+    if calibration.spoilers:
         print(
-            f"  (!) {', '.join(found.spoilers)}: fits the other poses badly; look at it, or "
+            f"  (!) {', '.join(calibration.spoilers)}: fits the other poses badly; look at it, or "
             f"capture it again"
         )
     alone = ", ".join(
         f"{name} {error:.4f}"
-        for name, error in zip(("camera", "projector"), found.alone_rms_px, strict=True)
+        for name, error in zip(("camera", "projector"), calibration.alone_rms_px, strict=True)
     )
     print(
         f"alone           {alone} px (each device by OpenCV's calibrateCamera, with a perfect "
         f"board)"
     )
-    for name, device in (("camera", found.camera), ("projector", found.projector)):
+    for name, device in (("camera", calibration.camera), ("projector", calibration.projector)):
         values = [
             f"{label} {getattr(device.pinhole, label):.2f} "
             + (f"+- {sigma:.2f}" if sigma else "(fixed)")
@@ -380,11 +381,13 @@ def print_calibration(found: "Calibration") -> None:
         print(f"{name:<15} {', '.join(values)} px; {device.lens}: {terms}")
     x, y, z = (
         f"{length:.2f} +- {sigma:.2f}"
-        for length, sigma in zip(found.translation_mm, found.translation_sigma_mm, strict=True)
+        for length, sigma in zip(
+            calibration.translation_mm, calibration.translation_sigma_mm, strict=True
+        )
     )
     print(
-        f"translation     {x}, {y}, {z} mm; baseline {found.baseline_mm:.2f} mm; scale "
-        f"{found.scale}"
+        f"translation     {x}, {y}, {z} mm; baseline {calibration.baseline_mm:.2f} mm; scale "
+        f"{calibration.scale}"
     )
 
 

@@ -130,8 +130,8 @@ def _print(result: "DecodedCapture") -> None:
             share = "" if name in ("low_modulation", "not_asked") else f"{100 * pixels / lit:.2f}%"
             table.add_row(name.replace("_", " "), f"{pixels:,}", share)
     show(table)
-    found = decoded.depth_mm > 0
-    depths, sigmas = decoded.depth_mm[found].astype(np.float64), result.sigma_mm[found]
+    valid = decoded.depth_mm > 0
+    depths, sigmas = decoded.depth_mm[valid].astype(np.float64), result.sigma_mm[valid]
     source = "measured" if result.noise_measured else "given or assumed"
     print(
         f"depth           {depths.min():.1f} to {depths.max():.1f} mm, median "

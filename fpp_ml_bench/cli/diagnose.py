@@ -317,8 +317,8 @@ def _table(setup: Setup, rows: dict[str, list[View]]) -> Table:
     columns = [f"severity {severity}" if severity else "clean" for severity in severities]
     columns += ["wrong orders", "missed", "invented", "answered, mm", "confident errors"]
     table = Table("axis", numbers=columns, title=f"{setup.method.title}: two-sided MAE in mm")
-    for axis, found in rows.items():
-        means = severity_means(found)
+    for axis, views in rows.items():
+        means = severity_means(views)
         last = means[max(means)]
         cells = [
             millimetres(means[severity]["mae_mm"]) if severity in means else ""

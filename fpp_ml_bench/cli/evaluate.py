@@ -291,13 +291,13 @@ def verify(
 
     scored, opened = rows.read_scored(file), DatasetFolder(dataset)
     differences = verification.differences if isinstance(scored, Result) else rows.differences
-    found, shown = differences(scored, predictions, opened), printable(str(file), 500)  # type: ignore[arg-type]
-    problems, samples = found.lines, scored.dataset.samples
+    comparison, shown = differences(scored, predictions, opened), printable(str(file), 500)  # type: ignore[arg-type]
+    problems, samples = comparison.lines, scored.dataset.samples
     unchecked = f"not checked: {', '.join(rows.not_checked(scored))}: predictions don't tell them"
     if not problems:
         print(f"verified: {shown} is what {samples} predictions give\n{unchecked}")
         return OK
-    if found.processors:
+    if comparison.processors:
         print(
             f"the same within what processors change: {shown} and what {samples} predictions give. "
             f"These are other "

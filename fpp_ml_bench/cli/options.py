@@ -241,15 +241,15 @@ def parameter_of(entry: "Field[Any]", heading: str = OPTIONS) -> Any:
         entry.default is MISSING,
         [flag_of(entry), entry.name],
     )
-    told: dict[str, Any] = (
+    keywords: dict[str, Any] = (
         {"help": about.help} if required else {"help": about.help, "default": entry.default}
     )
     shown = about.metavar or "|".join(choices_of(entry))
-    valued = {"type": _Value(parser_of(entry)), "required": required, "metavar": shown, **told}
+    valued = {"type": _Value(parser_of(entry)), "required": required, "metavar": shown, **keywords}
     if about.positional:
         made: Any = click.Argument([entry.name], nargs=-1 if about.many else 1, **valued)
     elif _kinds(entry) == {"bool"}:
-        made = click.Option(words, is_flag=True, flag_value=not entry.default, **told)
+        made = click.Option(words, is_flag=True, flag_value=not entry.default, **keywords)
     else:
         made = click.Option(words, multiple=about.many, **valued)
     made.heading = "arguments" if about.positional else heading
@@ -324,11 +324,13 @@ class Command(click.Command):
 
     def sections(self, ctx: click.Context) -> dict[str, list[Row]]:
         """What the help lists: terms and what they mean, by heading."""
-        found: dict[str, list[Row]] = {"arguments": [], OPTIONS: []}
+        sections: dict[str, list[Row]] = {"arguments": [], OPTIONS: []}
         for param in self.get_params(ctx):
             if not getattr(param, "hidden", False):
-                found.setdefault(getattr(param, "heading", OPTIONS), []).append(row_of(param, ctx))
-        return found
+                sections.setdefault(getattr(param, "heading", OPTIONS), []).append(
+                    row_of(param, ctx)
+                )
+        return sections
 
 
 def heading_of(group: type, name: str) -> str:

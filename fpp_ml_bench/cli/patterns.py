@@ -51,7 +51,7 @@ def _family(text: str) -> "Crossed":
 PERIODS = value(
     "numbers such as 12,14,18 or 12-18",
     _numbers,
-    lambda found: found != () and all(0 <= one < 1e5 for one in found),
+    lambda values: values != () and all(0 <= number < 1e5 for number in values),
 )
 
 
@@ -161,26 +161,26 @@ def _design(settings: PatternSettings) -> None:
     used."""
     named = settings.rig in NAMED_RIGS
     rig = NAMED_RIGS[settings.rig]() if named else load_rig(settings.rig)
-    found = search(rig, settings, settings.pitches)
+    design = search(rig, settings, settings.pitches)
     families = dict.fromkeys(settings.pair, "asked for")
     if len(rig.fringe_directions) == 2:
         families.setdefault(replace(Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "its pair")
     if rig.crossed is not None:
         families.setdefault(rig.crossed, "its crossed")
     others = describe(rig, list(families), settings)
-    _print_design(rig, settings, found, list(zip(others, families.values(), strict=True)))
+    _print_design(rig, settings, design, list(zip(others, families.values(), strict=True)))
     if settings.picture is not None:
         beside = others[0] if others else describe(rig, [Crossed((18.0, 18.0))], settings)[0]
-        write_atomically(settings.picture, draw_design(rig, found, beside))
+        write_atomically(settings.picture, draw_design(rig, design, beside))
         print(f"wrote {settings.picture}")
     if settings.out is not None:
-        family = replace(found.proposed.crossed, shifts_deg=FIRST_SHIFTED_DEG)
+        family = replace(design.proposed.crossed, shifts_deg=FIRST_SHIFTED_DEG)
         save_rig(rig.with_crossed(family), settings.out)
         print(f"wrote {settings.out}; next: fpp-bench patterns {settings.out} --out DIR")
 
 
 def _print_design(
-    rig: Rig, assumed: Assumptions, found: Design, others: list[tuple[Candidate, str]]
+    rig: Rig, assumed: Assumptions, design: Design, others: list[tuple[Candidate, str]]
 ) -> None:
     (near_mm, far_mm), flat_deg = rig.working_range_mm, EpipolarLines.of(rig).flat_angle_deg
     print(
@@ -221,10 +221,10 @@ def _print_design(
         "expected, mm",
     )
     table = Table("", numbers=names, names=3)
-    every = max(-(-len(found.searched) // ROWS), 1)
-    shown = {id(candidate): candidate for candidate in (*found.searched[::every], found.proposed)}
+    every = max(-(-len(design.searched) // ROWS), 1)
+    shown = {id(candidate): candidate for candidate in (*design.searched[::every], design.proposed)}
     rows = [
-        (candidate, "proposed" if candidate is found.proposed else "")
+        (candidate, "proposed" if candidate is design.proposed else "")
         for candidate in shown.values()
     ]
     for candidate, about in sorted(rows, key=lambda row: -row[0].crossed.pitches_px[0]) + others:
@@ -251,11 +251,11 @@ def _print_design(
                 candidate.crossed.angles_deg[carrier],
             )
             print(f"note: {about}: the carrier of {pitch:g} px at {angle:g} degrees tells no depth")
-    crossed = found.proposed.crossed
+    crossed = design.proposed.crossed
     print(
         f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} "
         f"degrees: the least "
-        f"expected error of {len(found.searched)} periods; a guess of the model, measure it on "
+        f"expected error of {len(design.searched)} periods; a guess of the model, measure it on "
         f"frames of your scenes"
     )
 

@@ -288,13 +288,13 @@ class _Image:
         results = blocks.depth_and_reason(measured, self._rays(block), self.rig, self.limits)
         self.depth_mm[pixels], self.reason[pixels] = results
         for direction, details in self.details.items():
-            found = measured[direction]
+            coordinates = measured[direction]
             details.coordinate_px.reshape(-1)[pixels] = np.where(
-                found.reason == 0, found.coordinate_px, np.nan
+                coordinates.reason == 0, coordinates.coordinate_px, np.nan
             )
             details.modulation.reshape(-1)[pixels], details.phase.reshape(-1)[pixels] = (
-                found.modulation,
-                found.phase,
+                coordinates.modulation,
+                coordinates.phase,
             )
         return count
 

@@ -231,12 +231,12 @@ def depth_sigma_mm(
     noise = np.asarray(noise_grey, dtype=np.float64)
     if not (np.isfinite(noise) & (noise > 0)).all():
         raise DecodeError(f"noise_grey: expected grey levels above 0, got {noise.min():g}")
-    found = decoded.depth_mm > 0
-    rays = tuple(axis[found] for axis in rig.camera.rays())
-    of_found = noise[found] if noise.ndim else noise
-    precision = np.zeros(int(found.sum()))
+    valid = decoded.depth_mm > 0
+    rays = tuple(axis[valid] for axis in rig.camera.rays())
+    of_found = noise[valid] if noise.ndim else noise
+    precision = np.zeros(int(valid.sum()))
     for direction, measured in decoded.details.items():
-        code, modulation = rig.code(direction), measured.modulation[found]
+        code, modulation = rig.code(direction), measured.modulation[valid]
         fewer, systematic_px = 1.0, 0.0
         if isinstance(code, PhaseShift):
             fewer = 1.0 if steps is None else steps / len(code.fringes[0].shifts_deg)
@@ -249,12 +249,12 @@ def depth_sigma_mm(
         noise_px = code.sigma_px(modulation, of_found / np.sqrt(fewer))
         sigma_px = np.sqrt(noise_px**2 + systematic_px**2 + rig.calibration_px**2)
         slope = coordinate_slope_px_per_mm(
-            rig, decoded.depth_mm[found], direction, (rays[0], rays[1])
+            rig, decoded.depth_mm[valid], direction, (rays[0], rays[1])
         )
         precision += (slope / sigma_px) ** 2
     sigma_mm = np.zeros(decoded.depth_mm.shape, dtype=np.float32)
     with np.errstate(divide="ignore"):
-        sigma_mm[found] = np.where(precision > 0, 1 / np.sqrt(precision), np.finfo(np.float32).max)
+        sigma_mm[valid] = np.where(precision > 0, 1 / np.sqrt(precision), np.finfo(np.float32).max)
     return sigma_mm
 
 

@@ -83,7 +83,7 @@ def broken_rule(rig: Rig) -> str | None:
     if not AXES_DEG[0] <= angle <= AXES_DEG[1]:
         return f"the axes meet at {angle:.0f} degrees"
     covered = [math.hypot(*rig.image_frequency(along)) for along in ((1.0, 0.0), (0.0, 1.0))]
-    if not all(CODE_PX[0] <= one <= CODE_PX[1] for one in covered):
+    if not all(CODE_PX[0] <= px <= CODE_PX[1] for px in covered):
         return f"an image px covers {min(covered):.2g} to {max(covered):.2g} projector px"
     return None
 
@@ -183,21 +183,21 @@ def _coded(rig: Rig) -> Rig | None:
     covered = math.hypot(*rig.image_frequency((1.0, 0.0)))
     tried = {float(round(px * covered)) for px in np.geomspace(*PERIOD_PX, TRIED)}
     try:
-        found = search(rig, Assumptions(image_px=PERIOD_PX), tried).proposed
+        candidate = search(rig, Assumptions(image_px=PERIOD_PX), tried).proposed
         rig.check_sampling()
     except RigError:
         return None
-    if not _good(rig, found):
+    if not _good(rig, candidate):
         return None
-    proposed = found.crossed
+    proposed = candidate.crossed
     return rig.with_crossed(
         Crossed(proposed.pitches_px, proposed.angles_deg, shifts_deg=FIRST_SHIFTED_DEG)
     )
 
 
-def _good(rig: Rig, found: Candidate) -> bool:
+def _good(rig: Rig, candidate: Candidate) -> bool:
     return (
-        found.rival_rad >= LEAST_RIVAL_RAD
-        and found.wrong_share <= MOST_WRONG_SHARE
-        and found.expected_mm <= MOST_EXPECTED_SHARE * rig.standoff_m * MM_PER_M
+        candidate.rival_rad >= LEAST_RIVAL_RAD
+        and candidate.wrong_share <= MOST_WRONG_SHARE
+        and candidate.expected_mm <= MOST_EXPECTED_SHARE * rig.standoff_m * MM_PER_M
     )

@@ -250,11 +250,11 @@ def search(rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = 
 
 
 @styled
-def draw_design(rig: Rig, found: Design, other: Candidate) -> bytes:
+def draw_design(rig: Rig, design: Design, other: Candidate) -> bytes:
     """PNG of the proposed pair beside an ``other`` one on ``rig``: both lines on the torus, the
     distance of the nearest rival over depth, and the expected error of all pairs that were
     searched."""
-    lines, proposed = EpipolarLines.of(rig), found.proposed
+    lines, proposed = EpipolarLines.of(rig), design.proposed
     drawn = figure(11, 10)
     plots = drawn.subplots(2, 2)
     for axes, candidate in zip(plots[0], (other, proposed), strict=True):
@@ -269,20 +269,20 @@ def draw_design(rig: Rig, found: Design, other: Candidate) -> bytes:
         ylabel="distance of the phases, rad",
         ylim=(0, None),
     )
-    pitches = [candidate.crossed.pitches_px[0] for candidate in found.searched]
+    pitches = [candidate.crossed.pitches_px[0] for candidate in design.searched]
     for name, label in (
         ("phase_mm", "phases"),
         ("wrong_mm", "wrong orders"),
         ("expected_mm", "both"),
     ):
         plots[1, 1].plot(
-            pitches, [getattr(candidate, name) for candidate in found.searched], ".-", label=label
+            pitches, [getattr(candidate, name) for candidate in design.searched], ".-", label=label
         )
     plots[1, 1].set(
         title="expected error",
         xlabel="period of both carriers, projector px",
         ylabel="mean error, mm",
-        ylim=(0, 1.1 * max(candidate.expected_mm for candidate in found.searched)),
+        ylim=(0, 1.1 * max(candidate.expected_mm for candidate in design.searched)),
     )
     for axes in plots[1]:
         axes.legend()

@@ -120,17 +120,17 @@ def examine(
         "contradicting_share": given.contradicting,
     }
     systematic: dict[str, float] = {}
-    for one in sets:
-        findings += _steps_and_response(lines, one, rig, titles, measured, systematic)
-    for one in sets:
-        if (found := gray_edges(lines, one, rig, limits)) is None:
+    for fringe_set in sets:
+        findings += _steps_and_response(lines, fringe_set, rig, titles, measured, systematic)
+    for fringe_set in sets:
+        if (edges := gray_edges(lines, fringe_set, rig, limits)) is None:
             continue
-        measured[f"{one.direction}_offset_turns"] = found.offset_turns.value
+        measured[f"{fringe_set.direction}_offset_turns"] = edges.offset_turns.value
         # A frame that is late shifts all phases, too.
-        if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
+        if _is_offset(edges) and not any(finding.severity == "refuse" for finding in findings):
             torn = _torn(lines, sets, shape, rig, directions, limits, titles)
             return Examination(
-                tuple(torn) or (_offset(found, rig, one.direction),), not_checked, measured
+                tuple(torn) or (_offset(edges, rig, fringe_set.direction),), not_checked, measured
             )
     doubtful = (
         given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.coherent < TRIED
@@ -223,8 +223,8 @@ def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
     return [exchanged] if bright < dark else []
 
 
-def _is_offset(found: Edges) -> bool:
-    return found.clear and found.edges >= OFFSET_EDGES and found.offset_turns.exceeds(OFFSET_TURNS)
+def _is_offset(edges: Edges) -> bool:
+    return edges.clear and edges.edges >= OFFSET_EDGES and edges.offset_turns.exceeds(OFFSET_TURNS)
 
 
 def _misaligned(pattern: Pattern, rig: Rig) -> Finding:
@@ -243,16 +243,16 @@ def _misaligned(pattern: Pattern, rig: Rig) -> Finding:
     )
 
 
-def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
+def _offset(edges: Edges, rig: Rig, direction: Direction) -> Finding:
     code = rig.code(direction)
-    pitch, turns = rig.pitch(direction), found.offset_turns
+    pitch, turns = rig.pitch(direction), edges.offset_turns
     origin_px = (code.origin_px if isinstance(code, PhaseShift) else 0.0) - turns.value * pitch
     return Finding(
         "phase and Gray code",
         "refuse",
         f"the {direction} phase at the edges of the Gray cells is {360 * turns.value:.1f} +- "
         f"{360 * turns.sigma:.1f} degrees off, {abs(turns.value) * pitch:.2f} projector px, "
-        f"at {100 * found.agreeing:.0f}% of {found.edges} edges",
+        f"at {100 * edges.agreeing:.0f}% of {edges.edges} edges",
         "the sinusoids begin elsewhere than at the Gray code's first pixel (another origin, or "
         "sine for cosine)",
         f"if the Gray code begins at the pattern's first pixel: origin_px: {origin_px:.2f} "
@@ -261,37 +261,45 @@ def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
     )
 
 
-def _another_reading(found: Sequence[tuple[Reading, Fit]], given: Fit) -> Finding:
+def _another_reading(readings: Sequence[tuple[Reading, Fit]], given: Fit) -> Finding:
     listed = "; or ".join(
-        f"{reading.what} ({100 * fits.fitting:.0f}%)" for reading, fits in found[:4]
+        f"{reading.what} ({100 * fits.fitting:.0f}%)" for reading, fits in readings[:4]
     )
-    alike = " (these frames can't tell which)" if len(found) > 1 else ""
+    alike = " (these frames can't tell which)" if len(readings) > 1 else ""
     return Finding(
         "another reading fits",
         "refuse",
         f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit "
         f"another reading",
         f"{listed}{alike}",
-        "; or ".join(dict.fromkeys(reading.change for reading, _ in found[:4])),
+        "; or ".join(dict.fromkeys(reading.change for reading, _ in readings[:4])),
     )
 
 
 def _steps_and_response(
     lines: Lines,
-    one: FringeSet,
+    fringe_set: FringeSet,
     rig: Rig,
     titles: Sequence[str],
     measured: dict[str, float],
     systematic: dict[str, float],
 ) -> list[Finding]:
     """A step that is not what it should be, and the response, which is no fault of the capture."""
-    waves = ripples(lines, one) if one.pitch_px <= _FINEST * rig.pitch(one.direction) else {}
-    name, faults = f"{one.direction} fringes of {one.pitch_px:g} px", []
-    if (step := step_errors(one)) is not None and step[1].exceeds(STEP_RAD):
-        which = f"of {titles[one.frames[step[0]]]}" if one.steps > 4 else "of one of four steps"
+    waves = (
+        ripples(lines, fringe_set)
+        if fringe_set.pitch_px <= _FINEST * rig.pitch(fringe_set.direction)
+        else {}
+    )
+    name, faults = f"{fringe_set.direction} fringes of {fringe_set.pitch_px:g} px", []
+    if (step := step_errors(fringe_set)) is not None and step[1].exceeds(STEP_RAD):
+        which = (
+            f"of {titles[fringe_set.frames[step[0]]]}"
+            if fringe_set.steps > 4
+            else "of one of four steps"
+        )
         faults.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
     if (twice := waves.get(2)) is not None:
-        measured[f"{one.direction}_{one.pitch_px:g}px_ripple_rad"] = twice.size.value
+        measured[f"{fringe_set.direction}_{fringe_set.pitch_px:g}px_ripple_rad"] = twice.size.value
         if twice.size.exceeds(RIPPLE_RAD):
             faults.append(
                 f"the phase has an error of {twice.size.value:.3f} rad that repeats twice a period"
@@ -307,18 +315,18 @@ def _steps_and_response(
                 CAPTURE_IN_TIME,
             )
         ]
-    bent = waves.get(one.steps)
+    bent = waves.get(fringe_set.steps)
     if bent is None or not bent.size.exceeds(RESPONSE_RAD):
         return []
-    systematic[one.direction] = max(
-        systematic.get(one.direction, 0.0), bent.size.value / math.sqrt(2)
+    systematic[fringe_set.direction] = max(
+        systematic.get(fringe_set.direction, 0.0), bent.size.value / math.sqrt(2)
     )
     return [
         Finding(
             "response",
             "note",
-            f"{name}: the phase has an error of {bent.size.value:.3f} rad that repeats {one.steps} "
-            f"times a period",
+            f"{name}: the phase has an error of {bent.size.value:.3f} rad that repeats "
+            f"{fringe_set.steps} times a period",
             "the response of projector and camera is not straight (gamma)"
             if bent.symmetric
             else "",
@@ -331,23 +339,23 @@ def _steps_and_response(
 def _moved(sets: Sequence[FringeSet], torn: NDArray[np.bool_] | None = None) -> list[Finding]:
     """Sets of sinusoids whose mean images differ: all of them show the scene under the same mean
     light. With ``torn`` pixels (n,) of the lines: the others alone are looked at."""
-    for one, other in combinations(sets, 2):
-        both = one.good & other.good
+    for first, other in combinations(sets, 2):
+        both = first.good & other.good
         if torn is not None:
             both &= ~torn
         if both.sum() < LEAST_PX:
             continue
-        gain = float(np.median(other.mean[both]) / max(float(np.median(one.mean[both])), 1e-9))
+        gain = float(np.median(other.mean[both]) / max(float(np.median(first.mean[both])), 1e-9))
         # Over some neighbours, which share no noise.
-        difference = uniform_filter1d(other.mean - gain * one.mean, NEIGHBOURS_PX)[both]
-        apart = np.abs(difference) > 0.25 * one.modulation[both] + 6.0
+        difference = uniform_filter1d(other.mean - gain * first.mean, NEIGHBOURS_PX)[both]
+        apart = np.abs(difference) > 0.25 * first.modulation[both] + 6.0
         if apart.mean() > MOVED_SHARE:
             return [
                 Finding(
                     "scene moved",
                     "refuse",
-                    f"the mean images of the {one.direction} fringes of {one.pitch_px:g} px and "
-                    f"the "
+                    f"the mean images of the {first.direction} fringes of {first.pitch_px:g} px "
+                    f"and the "
                     f"{other.direction} ones "
                     f"of {other.pitch_px:g} px differ at {100 * apart.mean():.0f}% of the lit "
                     f"pixels",
@@ -379,20 +387,24 @@ def _torn(
         part = lines.at(np.flatnonzero(inside))
         of_band = fringe_sets(part, rig, directions)
         for i, j in equal_frames(
-            part, [one for one in of_band if not one.one_phase], rig, directions, True
+            part,
+            [fringe_set for fringe_set in of_band if not fringe_set.one_phase],
+            rig,
+            directions,
+            True,
         ):
             if not _never_alike(part, rig, band.side, i, j):
                 continue
             torn[band.side].setdefault(band, []).append(
                 f"{titles[j]} shows the image of {titles[i]}"
             )
-        for one in of_band:
-            name = f"the {one.direction} fringes of {one.pitch_px:g} px"
-            if (step := step_errors(one)) is not None:
+        for fringe_set in of_band:
+            name = f"the {fringe_set.direction} fringes of {fringe_set.pitch_px:g} px"
+            if (step := step_errors(fringe_set)) is not None:
                 sizes.setdefault((band.side, f"a step of {name} is wrong", STEP_RAD), {})[band] = (
                     step[1]
                 )
-            edges = gray_edges(part, one, rig, limits)
+            edges = gray_edges(part, fringe_set, rig, limits)
             if edges is not None and edges.clear:
                 fault = f"{name} are shifted against the Gray code"
                 sizes.setdefault((band.side, fault, OFFSET_TURNS), {})[band] = edges.offset_turns

@@ -129,18 +129,20 @@ def fit(
     # Gray code alone has no second opinion: a doubtful bit there is blur.
     alone = all(isinstance(rig.code(way), GrayOnly) for way in directions)
     contradicting = lit & (reason != 0) & ~(alone & (reason == Reason.INCONSISTENT_ORDER))
-    for one in fringe_sets(lines, rig, directions):
-        if one.steps > 3:
-            shown = one.mean + one.modulation * np.cos(one.phase + one.shifts_rad[:, None])
-            misfit = ((one.levels - shown) ** 2).mean(axis=0)
-            reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = (
+    for fringe_set in fringe_sets(lines, rig, directions):
+        if fringe_set.steps > 3:
+            shown = fringe_set.mean + fringe_set.modulation * np.cos(
+                fringe_set.phase + fringe_set.shifts_rad[:, None]
+            )
+            misfit = ((fringe_set.levels - shown) ** 2).mean(axis=0)
+            reason[(reason == 0) & (misfit > (LARGEST_MISFIT * fringe_set.modulation) ** 2)] = (
                 Reason.INCONSISTENT_ORDER
             )
-        found = gray_edges(lines, one, rig, limits)
+        cell_edges = gray_edges(lines, fringe_set, rig, limits)
         edges *= (
             1.0
-            if found is None or found.edges < _FEWEST_PAIRS
-            else min(found.agreeing, found.forward)
+            if cell_edges is None or cell_edges.edges < _FEWEST_PAIRS
+            else min(cell_edges.agreeing, cell_edges.forward)
         )
     bright = max(int((lit | saturated).sum()), 1)
     counted = (lit | (np.ptp(levels, axis=0) >= CLEARLY_LIT_GREY)) & ~saturated

@@ -236,15 +236,23 @@ def equal_frames(
     """Pairs of frames that should differ and show the same, but for noise and a few percent of
     brightness: within a set (``following``: only if they follow one another), and one after the
     other."""
-    found = []
-    for one in sets:
-        part = lines.at(_thinned(one.good))
-        middle = float(np.median(one.modulation[one.good])) if one.good.any() else 0.0
-        for i, j in pairwise(range(one.steps)) if following else combinations(range(one.steps), 2):
-            apart = one.shifts_rad[i] - one.shifts_rad[j]
+    pairs = []
+    for fringe_set in sets:
+        part = lines.at(_thinned(fringe_set.good))
+        middle = (
+            float(np.median(fringe_set.modulation[fringe_set.good]))
+            if fringe_set.good.any()
+            else 0.0
+        )
+        for i, j in (
+            pairwise(range(fringe_set.steps))
+            if following
+            else combinations(range(fringe_set.steps), 2)
+        ):
+            apart = fringe_set.shifts_rad[i] - fringe_set.shifts_rad[j]
             most = EQUAL_SHARE * math.sqrt(2) * abs(math.sin(apart / 2)) * middle
-            if most > 0 and _same(part, one.frames[i], one.frames[j], most):
-                found.append((one.frames[i], one.frames[j]))
+            if most > 0 and _same(part, fringe_set.frames[i], fringe_set.frames[j], most):
+                pairs.append((fringe_set.frames[i], fringe_set.frames[j]))
     levels = lines.levels[:, _thinned(lines.lit)].astype(np.float64)
     low, high = levels.min(axis=0), levels.max(axis=0)
     from_middle, span = levels - (low + high) / 2, float(np.median(high - low))
@@ -255,7 +263,7 @@ def equal_frames(
         if frame.direction is None or frame.direction in directions
     ]
     for i, j in pairwise(coded):
-        same_set = any({i, j} <= set(one.frames) for one in sets)
+        same_set = any({i, j} <= set(fringe_set.frames) for fringe_set in sets)
         # A frame that is bright or dark all over may well be followed by another one.
         varied = all(min(bright[k], dark[k]) > 0.05 for k in (i, j))
         apart = np.abs(levels[i] - levels[j])
@@ -265,8 +273,8 @@ def equal_frames(
             and np.median(apart) < 0.02 * span
             and (apart < 0.1 * span).mean() > 0.98
         ):
-            found.append((i, j))
-    return found
+            pairs.append((i, j))
+    return pairs
 
 
 def _same(part: Lines, i: int, j: int, most: float) -> bool:
@@ -304,20 +312,27 @@ def _trimmed(values: NDArray) -> float:
     return float(np.sort(values)[: -(-9 * len(values) // 10)].mean())
 
 
-def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
+def step_errors(fringe_set: FringeSet) -> tuple[int, Estimate] | None:
     """Of four steps and more: the position of the step whose shift is farthest from the rig file's,
     and by how many rad (with four, all are as far). None where too little tells, and where a narrow
     range of phases can't tell it from other faults."""
-    picked = _thinned(one.good)
-    if one.steps < 4 or len(picked) < LEAST_PX:
+    picked = _thinned(fringe_set.good)
+    if fringe_set.steps < 4 or len(picked) < LEAST_PX:
         return None
-    mean, phase, modulation = one.mean[picked], one.phase[picked], one.modulation[picked]
-    weights = phase_weights(one.shifts_rad)
-    model = np.stack([np.ones(one.steps), np.cos(one.shifts_rad), np.sin(one.shifts_rad)], axis=1)
+    mean, phase, modulation = (
+        fringe_set.mean[picked],
+        fringe_set.phase[picked],
+        fringe_set.modulation[picked],
+    )
+    weights = phase_weights(fringe_set.shifts_rad)
+    model = np.stack(
+        [np.ones(fringe_set.steps), np.cos(fringe_set.shifts_rad), np.sin(fringe_set.shifts_rad)],
+        axis=1,
+    )
     influence = np.einsum("ij,ji->i", model, weights)
     worst: tuple[int, Estimate] | None = None
-    for n, shift in enumerate(one.shifts_rad):
-        residual = one.levels[n, picked] - mean - modulation * np.cos(phase + shift)
+    for n, shift in enumerate(fringe_set.shifts_rad):
+        residual = fringe_set.levels[n, picked] - mean - modulation * np.cos(phase + shift)
         waves = [wave(angle) for angle in (phase, 2 * (phase + shift)) for wave in (np.cos, np.sin)]
         terms = np.stack([mean, *(modulation * wave for wave in waves)], axis=1)
         scaled = terms / np.maximum(np.linalg.norm(terms, axis=0), 1e-12)
@@ -349,17 +364,21 @@ class Ripple(NamedTuple):
         return not self.cosine.exceeds(SYMMETRIC * self.size.value)
 
 
-def ripples(lines: Lines, one: FringeSet) -> dict[int, Ripple]:
+def ripples(lines: Lines, fringe_set: FringeSet) -> dict[int, Ripple]:
     """By harmonic, the error of the phase that goes with twice and N times the phase; none where
     the image shows too few windows of two periods and more."""
     slopes = []
     for across in (True, False):
-        pixels = one.good & (lines.across == across)
+        pixels = fringe_set.good & (lines.across == across)
         pairs = np.flatnonzero(pixels[:-1] & pixels[1:] & lines.joined[:-1])
         if len(pairs) >= LEAST_PX:
             slopes.append(
                 (
-                    float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs])))),
+                    float(
+                        np.median(
+                            np.abs(_wrapped(fringe_set.phase[pairs + 1] - fringe_set.phase[pairs]))
+                        )
+                    ),
                     across,
                 )
             )
@@ -368,12 +387,12 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Ripple]:
     if not SHORTEST_PERIOD_PX <= period <= LONGEST_WINDOW_PX / WINDOW_PERIODS:
         return {}
     windows = _windows(
-        one.good & (lines.across == across), lines.joined, math.ceil(WINDOW_PERIODS * period)
+        fringe_set.good & (lines.across == across), lines.joined, math.ceil(WINDOW_PERIODS * period)
     )
     if len(windows) < FEWEST_WINDOWS:
         return {}
-    phase = np.unwrap(one.phase[windows], axis=1) + one.shifts_rad[0]
-    harmonics = [1, 2, *([one.steps] if 2 < one.steps <= period / 2.5 else [])]
+    phase = np.unwrap(fringe_set.phase[windows], axis=1) + fringe_set.shifts_rad[0]
+    harmonics = [1, 2, *([fringe_set.steps] if 2 < fringe_set.steps <= period / 2.5 else [])]
     place = np.linspace(-1, 1, phase.shape[1])
     surface = np.linalg.qr(np.stack([np.ones_like(place), place, place**2, place**3], axis=1))[0]
 
@@ -395,14 +414,14 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Ripple]:
     bread = np.linalg.pinv(design.T @ design)
     scores = np.einsum("wlt,wl->wt", terms[kept], (rest - terms @ solution)[kept])
     covariance = bread @ (scores.T @ scores) @ bread
-    found = {}
+    by_harmonic = {}
     for k, harmonic in enumerate(harmonics):
         pair = solution[2 * k : 2 * k + 2]
         sigma = float(np.sqrt(np.trace(covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]) / 2))
-        found[harmonic] = Ripple(
+        by_harmonic[harmonic] = Ripple(
             Estimate(float(np.hypot(*pair)), sigma), Estimate(float(pair[0]), sigma)
         )
-    return found
+    return by_harmonic
 
 
 def _windows(pixels: NDArray[np.bool_], joined: NDArray[np.bool_], length: int) -> NDArray[np.intp]:
@@ -426,7 +445,9 @@ def marked_saturated(
     """The lines with their saturated levels at `GREY_LEVELS`, and the level at which they are
     saturated: below that where the levels of sinusoids pile up there, as in a sum of saturated
     exposures."""
-    sinusoids = [index for one in fringe_sets(lines, rig, directions) for index in one.frames]
+    sinusoids = [
+        index for fringe_set in fringe_sets(lines, rig, directions) for index in fringe_set.frames
+    ]
     levels = lines.levels[sinusoids][:, lines.lit]
     top = levels.max() if levels.size else GREY_LEVELS
     near = levels > top - PILE_DEPTH * (top - levels.min()) if levels.size else levels
@@ -458,21 +479,23 @@ class Edges(NamedTuple):
         return self.agreeing > 0.8 and self.forward > 0.8
 
 
-def gray_edges(lines: Lines, one: FringeSet, rig: Rig, limits: Limits) -> Edges | None:
+def gray_edges(lines: Lines, fringe_set: FringeSet, rig: Rig, limits: Limits) -> Edges | None:
     """What the edges of the Gray cells say about the phase of the set; None without Gray code or
     with few edges."""
-    code = rig.code(one.direction)
-    if not isinstance(code, PhaseShift) or code.gray is None or one.number != code.finest:
+    code = rig.code(fringe_set.direction)
+    if not isinstance(code, PhaseShift) or code.gray is None or fringe_set.number != code.finest:
         return None
     length, levels = (
-        rig.pattern_length(one.direction),
-        lines.levels[list(rig.sequence.gray(one.direction))],
+        rig.pattern_length(fringe_set.direction),
+        lines.levels[list(rig.sequence.gray(fringe_set.direction))],
     )
-    cells = code.gray.cells_of(levels, one.mean, one.modulation, limits.ambiguous_fraction)
-    usable = one.good & cells.trusted
+    cells = code.gray.cells_of(
+        levels, fringe_set.mean, fringe_set.modulation, limits.ambiguous_fraction
+    )
+    usable = fringe_set.good & cells.trusted
     first = np.flatnonzero(usable[:-1] & usable[1:] & lines.joined[:-1])
     first = first[np.abs(cells.number[first + 1] - cells.number[first]) == 1]
-    step = _wrapped(one.phase[first + 1] - one.phase[first])
+    step = _wrapped(fringe_set.phase[first + 1] - fringe_set.phase[first])
     kept = np.abs(step) < TAU / 4
     first, step = first[kept], step[kept]
     edge_px = (
@@ -480,7 +503,7 @@ def gray_edges(lines: Lines, one: FringeSet, rig: Rig, limits: Limits) -> Edges 
         + code.gray.centre_px(cells.number[first + 1], length)
     ) / 2
     offset = _wrapped(
-        one.phase[first] + step / 2 - TAU * (edge_px - code.origin_px) / code.pitch_px
+        fringe_set.phase[first] + step / 2 - TAU * (edge_px - code.origin_px) / code.pitch_px
     )
     known = np.isfinite(offset)
     if known.sum() < 40:

@@ -288,8 +288,8 @@ def _nodes(path: Path) -> dict[str, Any]:
 
 def _other_layout(keys: Iterable[str]) -> str:
     expected = "expected the nodes M1, D1, M2, D2, R, T (OpenCV's matrices)"
-    found = printable(", ".join(keys)) or "none"
-    return f"is well-formed, but of another layout: {expected}, found the keys {found}; {_CURE}"
+    key_names = printable(", ".join(keys)) or "none"
+    return f"is well-formed, but of another layout: {expected}, found the keys {key_names}; {_CURE}"
 
 
 def _keys(text: str, suffix: str) -> list[str]:

@@ -150,9 +150,12 @@ def load_rig(path: str | Path) -> Rig:
             for key in ("camera_size", "projector_size")
             if key in given
         }
-        found = read_opencv_calibration(Path(path).parent / file, unit=unit, **sizes)
-        devices = {"camera": found.camera.to_dict(), "projector": found.projector.to_dict()}
-        pose = {"rotation": found.rotation, "translation_m": found.translation_m}
+        calibration = read_opencv_calibration(Path(path).parent / file, unit=unit, **sizes)
+        devices = {
+            "camera": calibration.camera.to_dict(),
+            "projector": calibration.projector.to_dict(),
+        }
+        pose = {"rotation": calibration.rotation, "translation_m": calibration.translation_m}
         rig = rig_from_dict({**entries, **devices, **pose})
         cure = f"write calibration: {{file: ..., unit: {'m' if unit == 'mm' else 'mm'}}}"
         check_lengths(rig, f"{file}: the translation", unit, cure)

@@ -94,18 +94,18 @@ class AnySequence(ABC):
     def equal_steps(self) -> list[tuple[tuple[int, ...], NDArray[np.float64]]]:
         """Every set of sinusoids of one period in equal steps: frame indices, and shifts in
         turns."""
-        found = []
+        sets = []
         for direction in self.directions:
             code = self.code(direction)
             for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
                 steps = len(fringe.shifts_deg)
                 for sign in (1, -1):
                     if steps >= 3 and fringe.shifts_deg == equal_shifts(steps, sign):
-                        found.append(
+                        sets.append(
                             (self.period(direction, number), sign * np.arange(steps) / steps)
                         )
                         break
-        return found
+        return sets
 
     def __len__(self) -> int:
         return len(self.frames)

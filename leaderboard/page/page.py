@@ -243,7 +243,7 @@ def predicted_samples(
     Raises SubmissionError for a folder that no result was scored from, and says why."""
     results = [entry for entry in entries if folders and not entry.is_row_file]
     scored = {entry.row.result_sha256: read_scored(entry.path) for entry in results}
-    found: dict[str, Samples] = {}
+    samples: dict[str, Samples] = {}
     for folder, dataset in folders:
         why: FppBenchError | str = "row files name no samples; give the result of fpp-eval"
         of_folder = {}
@@ -257,8 +257,8 @@ def predicted_samples(
             raise SubmissionError(
                 f"{printable(str(folder), 500)}: no given result was scored from it ({why})"
             )
-        found |= of_folder
-    return found
+        samples |= of_folder
+    return samples
 
 
 def _samples(result: Result, folder: Path, dataset: DatasetFolder) -> Samples:

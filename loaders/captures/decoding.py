@@ -446,14 +446,14 @@ def board_poses(
 
 
 def calibrated_rig(
-    found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None
+    calibration: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None
 ) -> Rig:
     """The rig of a calibration, with the sequence of ``stand_in``; its working range is
     ``range_mm``, or that of the boards' points and a margin. Its error is that of the poses which
     did not take part, or of those which did."""
     depths = [
-        found.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2]
-        for pose in found.poses
+        calibration.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2]
+        for pose in calibration.poses
     ]
     near, far = range_mm or (
         float(np.min(depths)) * (1 - RANGE_MARGIN),
@@ -461,11 +461,11 @@ def calibrated_rig(
     )
     return replace(
         stand_in,
-        camera=found.camera.pinhole,
-        projector=found.projector.pinhole,
-        rotation=found.rotation,
-        translation_m=found.translation_m,
-        calibration_px=found.held_out_rms_px
-        if np.isfinite(found.held_out_rms_px)
-        else found.rms_px.both,
+        camera=calibration.camera.pinhole,
+        projector=calibration.projector.pinhole,
+        rotation=calibration.rotation,
+        translation_m=calibration.translation_m,
+        calibration_px=calibration.held_out_rms_px
+        if np.isfinite(calibration.held_out_rms_px)
+        else calibration.rms_px.both,
     ).with_range((near, far))

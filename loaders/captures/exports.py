@@ -114,11 +114,11 @@ def pixel_normals(
     rays, depth = _rays_and_depth(depth_mm, camera)
     points = rays * depth[..., None]
     tangents = []
-    for one, other in (((_BEFORE, _ALL), (_AFTER, _ALL)), ((_ALL, _BEFORE), (_ALL, _AFTER))):
-        joined = _joined(rays, depth, one, other, steepest)
-        difference = np.where(joined[..., None], points[other] - points[one], 0.0)
+    for part, other in (((_BEFORE, _ALL), (_AFTER, _ALL)), ((_ALL, _BEFORE), (_ALL, _AFTER))):
+        joined = _joined(rays, depth, part, other, steepest)
+        difference = np.where(joined[..., None], points[other] - points[part], 0.0)
         tangent = np.zeros_like(points)
-        tangent[one] += difference
+        tangent[part] += difference
         tangent[other] += difference
         tangents.append(tangent)
     normals = np.cross(tangents[0], tangents[1])
@@ -138,7 +138,7 @@ def triangles(depth_mm: ArrayLike, camera: Pinhole) -> NDArray[np.int64]:
 
     def whole(*corners: Part) -> tuple[NDArray[np.bool_], tuple[Part, ...]]:
         """Where three corners belong to one surface, pair by pair."""
-        pairs = [_joined(rays, depth, one, other) for one, other in combinations(corners, 2)]
+        pairs = [_joined(rays, depth, corner, other) for corner, other in combinations(corners, 2)]
         return np.logical_and.reduce(pairs), corners
 
     falling = whole(_FIRST, _BELOW, _ACROSS), whole(_FIRST, _ACROSS, _RIGHT)
@@ -190,13 +190,13 @@ def _rays_and_depth(
 def _joined(
     rays: NDArray[np.float64],
     depth: NDArray[np.float64],
-    one: Part,
+    part: Part,
     other: Part,
     steepest: float = STEEPEST,
 ) -> NDArray[np.bool_]:
-    """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
-    near, far = depth[one], depth[other]
-    apart = (near + far) / 2 * np.linalg.norm(rays[one] - rays[other], axis=-1)
+    """Whether the pixels at ``part`` and ``other`` have a depth and belong to the same surface."""
+    near, far = depth[part], depth[other]
+    apart = (near + far) / 2 * np.linalg.norm(rays[part] - rays[other], axis=-1)
     return (near > 0) & (far > 0) & (np.abs(near - far) <= steepest * apart)
 
 
@@ -305,9 +305,9 @@ def write_capture(
     """Write a decoded capture in place of what an earlier decoding left in ``folder``: the
     ``forms`` of `export_capture`, maps as .npy, a picture, and `REPORT` at last."""
     clear_outputs(folder)
-    decoded, found = result.decoded, result.decoded.depth_mm > 0
+    decoded, valid = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
-    title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
+    title = f"{capture.files[0].parent.name}: {100 * valid.mean():.1f}% of the pixels with depth"
     sigma_mm, modulation, reason = result.sigma_mm, result.modulation, decoded.reason
     contents = {
         "sigma_mm.npy": _npy(sigma_mm),
@@ -332,7 +332,7 @@ def write_capture(
         pixels=decoded.counts,
         noise_grey=result.noise_grey,
         noise_measured=result.noise_measured,
-        median_sigma_mm=float(np.median(sigma_mm[found])),
+        median_sigma_mm=float(np.median(sigma_mm[valid])),
         notes=list(result.notes),
         reasons={reason.name.lower(): int(reason) for reason in Reason},
     )

@@ -330,9 +330,9 @@ def split_captures(captures: Iterable[Capture], splits: Splits | None) -> dict[s
         for name in getattr(splits, split):
             places.setdefault(name, []).append(split)
     problems = [
-        f"object {name!r} is listed under {' and '.join(found)}; keep it in one split"
-        for name, found in places.items()
-        if len(found) > 1
+        f"object {name!r} is listed under {' and '.join(split_names)}; keep it in one split"
+        for name, split_names in places.items()
+        if len(split_names) > 1
     ]
     problems += [
         f"object {name!r} has no captures; remove it" for name in places if name not in objects
@@ -419,8 +419,8 @@ def listed(problems: list[str]) -> Iterator[None]:
 
 
 def _folders(folder: Path) -> list[Path]:
-    found = [path for path in visible(folder, CaptureError) if path.is_dir()]
-    return sorted(found, key=lambda path: natural_key(path.name))
+    folders = [path for path in visible(folder, CaptureError) if path.is_dir()]
+    return sorted(folders, key=lambda path: natural_key(path.name))
 
 
 def _images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:

@@ -163,7 +163,7 @@ def import_rows(
     except (LayoutError, CaptureError) as error:
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
             problems = [
-                line for found in pool.map(problems_of, reader.samples.values()) for line in found
+                line for lines in pool.map(problems_of, reader.samples.values()) for line in lines
             ]
         raise reader.refusal(problems or [str(error)]) from error
 

@@ -133,9 +133,9 @@ def at_borders(state: NDArray[np.int8]) -> NDArray[np.bool_]:
     """The pixels beside one, across or along, with the opposite sign of ``state`` (H, W); bool (H
     W,)."""
     border = np.zeros(state.shape, dtype=bool)
-    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
-        changes = state[one] * state[other] < 0
-        border[one] |= changes
+    for part, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        changes = state[part] * state[other] < 0
+        border[part] |= changes
         border[other] |= changes
     return border.ravel()
 

@@ -133,7 +133,7 @@ class BuildSettings:
 
     def sized(self, mesh: SolidMesh) -> SolidMesh:
         """``mesh`` in the size in which it is built."""
-        own = any(mesh.name == one.name for one in self.user_meshes)
+        own = any(mesh.name == user_mesh.name for user_mesh in self.user_meshes)
         if own or self.object_scale == 1:
             return mesh
         return replace(mesh, vertices_m=mesh.vertices_m * self.object_scale)
@@ -187,7 +187,9 @@ def _check_same_devices(rig: Rig, other: Rig) -> None:
                 f"that photographs "
                 f"{w} x {h} px; calibrate at the size that is built"
             )
-    codes = [[one.code(direction) for direction in one.directions] for one in (rig, other)]
+    codes = [
+        [this_rig.code(direction) for direction in this_rig.directions] for this_rig in (rig, other)
+    ]
     if list(rig.sequence) != list(other.sequence) or codes[0] != codes[1]:
         raise BuildError(
             "the rig to decode with has another sequence or pitch than the one that photographs; "
@@ -241,7 +243,7 @@ def volume_scale(rig: Rig) -> float:
     paper_standoff = STANDOFF_M * MM_PER_M
     before = min(paper_standoff - paper_near, paper_far - paper_standoff)
     by_depth = min(standoff - near, far - standoff) / before
-    width, paper_width = (_half_view(one.camera) for one in (rig, NAMED_RIGS["paper"]()))
+    width, paper_width = (_half_view(this_rig.camera) for this_rig in (rig, NAMED_RIGS["paper"]()))
     # The nearest point of an object lies ``before`` times the scale before the standoff.
     by_view = standoff * width / (paper_width * paper_near + before * width)
     scale = min(by_depth, by_view)

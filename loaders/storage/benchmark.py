@@ -105,27 +105,31 @@ def benchmark_of(content: Mapping[str, str]) -> Benchmark | None:
 
 
 def known_problem(
-    content: Mapping[str, str], split: str, target: str, mode: str, found: Mapping[str, Counts]
+    content: Mapping[str, str],
+    split: str,
+    target: str,
+    mode: str,
+    file_counts: Mapping[str, Counts],
 ) -> str | None:
-    """What is not as in the named benchmark that has ``content``, of the objects ``found`` in a
-    result: objects, samples, or pixels of object and void; a sentence. None where all is, or the
-    content is none of the benchmarks'."""
+    """What is not as in the named benchmark that has ``content``, by the ``file_counts`` of the
+    objects in a result: objects, samples, or pixels of object and void; a sentence. None where all
+    is, or the content is none of the benchmarks'."""
     benchmark = benchmark_of(content)
     expected = {} if benchmark is None else benchmark.counts(split, mode, target)
     if benchmark is None or not expected:
         return None
     where = f"{benchmark.title}, {split} split,"
-    if found.keys() != expected.keys():
+    if file_counts.keys() != expected.keys():
         foreign, missing = (
-            sorted(found.keys() - expected.keys()),
-            sorted(expected.keys() - found.keys()),
+            sorted(file_counts.keys() - expected.keys()),
+            sorted(expected.keys() - file_counts.keys()),
         )
         said = [f"has no object {name!r}, which this file has" for name in foreign[:1]]
         said += [f"has the object {name!r}, which this file lacks" for name in missing[:1]]
         return f"{where} {' and '.join(said)}"
     for name, counts in expected.items():
         words = "samples", "object pixels", "void pixels", "views without object or background"
-        for what, wanted, given in zip(words, counts, found[name], strict=True):
+        for what, wanted, given in zip(words, counts, file_counts[name], strict=True):
             if given is not None and wanted != given:
                 return f"{where} has {wanted} {what} of {name!r}, this file says {given}"
     return None

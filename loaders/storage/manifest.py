@@ -239,8 +239,8 @@ def strictly(kind: type[Kind], value: Any, where: str = "") -> Kind:
         plain = inner[1] is Any  # and so are the keys of what was JSON
         if plain:
             return value  # type: ignore[return-value]
-        found = {key: strictly(inner[1], value[key], f"{where} {key}") for key in value}
-        return found  # type: ignore[return-value]
+        entries = {key: strictly(inner[1], value[key], f"{where} {key}") for key in value}
+        return entries  # type: ignore[return-value]
     if of in (list, tuple) and isinstance(value, list) and (of is list or len(value) == len(inner)):
         return of(strictly(inner[0], entry, where) for entry in value)  # type: ignore[no-any-return]
     if kind is Any or type(value) is kind:

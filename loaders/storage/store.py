@@ -119,14 +119,14 @@ class DatasetFolder:
         """``split/column``, and the hash of its images, of which ``hashes`` are those of the
         samples (`image_hash`). Raises `DatasetError` where the manifest has another: the files were
         changed after it was written."""
-        name, found = f"{split}/{column}", layout.column_hash(hashes)
-        if found != self.content.get(name):
+        name, digest = f"{split}/{column}", layout.column_hash(hashes)
+        if digest != self.content.get(name):
             raise DatasetError(
                 f"{self.path}: {column} of split {split} is not what {MANIFEST} says, so it was "
                 f"changed or damaged; "
                 "run: fpp-bench verify, and build or copy the dataset again"
             )
-        return name, found
+        return name, digest
 
     @property
     def size(self) -> tuple[int, int]:

@@ -173,9 +173,9 @@ def _split_findings(manifest: Manifest) -> list[str]:
                 )
             expected_views = set(seen) if manifest.origin == CAPTURED else VIEWS
             if sorted(seen) != sorted(expected_views):
-                expected, found = ", ".join(expected_views), ", ".join(seen)
+                expected, actual = ", ".join(expected_views), ", ".join(seen)
                 findings.append(
-                    f"object {name!r} in {split}: expected the views {expected}, found {found}"
+                    f"object {name!r} in {split}: expected the views {expected}, found {actual}"
                 )
             if (
                 manifest.origin == GENERATED
