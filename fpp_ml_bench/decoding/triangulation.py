@@ -233,7 +233,7 @@ def depth_sigma_mm(
         raise DecodeError(f"noise_grey: expected grey levels above 0, got {noise.min():g}")
     valid = decoded.depth_mm > 0
     rays = tuple(axis[valid] for axis in rig.camera.rays())
-    of_found = noise[valid] if noise.ndim else noise
+    valid_noise = noise[valid] if noise.ndim else noise
     precision = np.zeros(int(valid.sum()))
     for direction, measured in decoded.details.items():
         code, modulation = rig.code(direction), measured.modulation[valid]
@@ -246,7 +246,7 @@ def depth_sigma_mm(
                 else systematic_rad.get(direction, 0.0)
             )
             systematic_px = code.pitch_px * rad / (2 * np.pi)
-        noise_px = code.sigma_px(modulation, of_found / np.sqrt(fewer))
+        noise_px = code.sigma_px(modulation, valid_noise / np.sqrt(fewer))
         sigma_px = np.sqrt(noise_px**2 + systematic_px**2 + rig.calibration_px**2)
         slope = coordinate_slope_px_per_mm(
             rig, decoded.depth_mm[valid], direction, (rays[0], rays[1])
