@@ -3,7 +3,6 @@ the object is, at the pixels of what a route observed, and what a route makes of
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,11 +44,19 @@ class AnyFringes:
     signs: NDArray[np.float64]
     networks: Sequence[FringeNet]
     threshold: float
+    warp: Warp
+    """From the image to one that the networks know."""
 
-    @cached_property
-    def warp(self) -> Warp:
-        """From the image to one that the networks know."""
-        return Warp.to_periods(self.step_rad, self.signs)
+    @classmethod
+    def of(
+        cls,
+        step_rad: NDArray[np.float64],
+        signs: NDArray[np.float64],
+        networks: Sequence[FringeNet],
+        threshold: float = 0.0,
+    ) -> "AnyFringes":
+        """With the warp that the carriers need."""
+        return cls(step_rad, signs, networks, threshold, Warp.to_periods(step_rad, signs))
 
     def answer(self, seen: Capture, grey: Image) -> tuple[Phases, Mask]:
         """Phases of the K carriers of ``grey`` (h, w), which was observed as ``seen``, and the

@@ -9,7 +9,6 @@ the variances that the members state and the variance between their phases (Laks
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -114,20 +113,25 @@ class FringePhase:
     geometry: Geometry
     networks: Sequence[FringeNet]
     learned_px: float
+    warp: Warp | None
+    """From the turned image; None where it is left as it is."""
 
-    @cached_property
-    def warp(self) -> Warp:
-        """From the turned image."""
-        rotation, model = self.geometry.rotation, self.geometry.model
+    @classmethod
+    def of(
+        cls, geometry: Geometry, networks: Sequence[FringeNet], learned_px: float
+    ) -> "FringePhase":
+        """For the fringes of a geometry."""
+        rotation, model = geometry.rotation, geometry.model
         phase = model.layer.absolute_phase(model.rig.standoff_m * MM_PER_M)
         turned = rotation.sign * rotation.turn(phase)
         step_rad = [np.diff(turned, axis=axis).mean() for axis in (1, 0)]
-        return Warp.of_one(np.array(step_rad), self.learned_px)
+        warp = Warp.of_one(np.array(step_rad), learned_px)
+        return cls(geometry, networks, learned_px, warp if warp.needed else None)
 
     def phases(self, seen: Observation) -> Phases:
         """Of the one carrier."""
         rotation, grey = self.geometry.rotation, seen.greys[0]
-        if self.warp.needed:
+        if self.warp is not None:
             grey = np.ascontiguousarray(rotation.turn(grey))
             turned = warped_phases(self.networks, grey, self.learned_px, self.warp)
         else:
@@ -160,15 +164,20 @@ class CrossedPhases:
     carriers: Carriers
     learned: Carriers
     networks: Sequence[FringeNet]
+    warp: Warp | None
+    """None where the image is left as it is."""
 
-    @cached_property
-    def warp(self) -> Warp:
-        """From the image to the networks'."""
-        return Warp.of_pair(self.carriers, self.learned)
+    @classmethod
+    def of(
+        cls, carriers: Carriers, learned: Carriers, networks: Sequence[FringeNet]
+    ) -> "CrossedPhases":
+        """With the warp that the carriers need."""
+        warp = Warp.of_pair(carriers, learned)
+        return cls(carriers, learned, networks, warp if warp.needed else None)
 
     def phases(self, seen: CrossedObservation) -> Phases:
         """Of both carriers."""
-        if self.warp.needed:
+        if self.warp is not None:
             return warped_phases(self.networks, seen.grey, self.learned.period_px, self.warp)
         scene = FringeScene.of(seen.grey, self.carriers.period_px, seen.crop)
         return phases_of(self.networks, fringe_channels(scene))[0]

@@ -445,7 +445,7 @@ class FringeNetMethod(LearnedRoute[Measurement]):
             learned = Carriers.of(learned_rig, learned_rig.crossed or Crossed.of_pair(learned_rig))
             self.frames_used = rig.sequence.crossed_frames[:1]
             pair = TwoCarriers(rig, Settings(min_confidence=given.min_confidence))
-            phases = CrossedPhases(pair.carriers, learned, networks)
+            phases = CrossedPhases.of(pair.carriers, learned, networks)
             self.route = two_carriers(pair, phases=phases.before, learned=phases.after)
         else:
             way: Direction = "vertical" if fringes == "vertical" else "horizontal"
@@ -455,7 +455,7 @@ class FringeNetMethod(LearnedRoute[Measurement]):
                 pitch_setting(rig, way),
             )
             model = OneCarrier(rig, own)
-            part = FringePhase(Geometry(model), networks, learned_px)
+            part = FringePhase.of(Geometry(model), networks, learned_px)
             self.route = one_carrier(model, learned=part)
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"

@@ -144,7 +144,7 @@ def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None
     crop = seen.crop
     cut = truth[:, *crop]
     if fringes == "crossed":
-        part = CrossedPhases(model.carriers, model.carriers, [Perfect(cut)])
+        part = CrossedPhases.of(model.carriers, model.carriers, [Perfect(cut)])
         route, measured = (
             two_carriers(model, phases=part.before, learned=part.after),
             two_carriers(model),
@@ -152,7 +152,7 @@ def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None
     else:
         rotation = Geometry(model).rotation
         perfect = Perfect(rotation.turn(cut) * rotation.sign)
-        part = FringePhase(Geometry(model), [perfect], model.period_px)
+        part = FringePhase.of(Geometry(model), [perfect], model.period_px)
         route, measured = one_carrier(model, learned=part), one_carrier(model)
     found = part.phases(seen)
     assert np.abs(wrapped(found.phase_rad - truth[:, *crop])).max() < 1e-3
