@@ -36,9 +36,6 @@ as long as the relief that is measured; above, hollows lie in shadow."""
 CODE_PX = 0.35, 2.5
 """Projector px that an image px covers: a finer camera wastes pixels, a coarser one does not sample
 the code."""
-LEAST_RIVAL_RAD = 0.15
-"""Phase of the nearest rival order: three times what crossed fringes' phases are off by in a clean
-image."""
 MOST_WRONG_SHARE, MOST_EXPECTED_SHARE = 0.04, 0.0025
 """Wrong orders of single pixels, and expected error by the standoff, of the proposed carriers."""
 LINES_PX = 22.0
@@ -197,7 +194,6 @@ def _coded(rig: Rig) -> Rig | None:
 
 def _good(rig: Rig, candidate: Candidate) -> bool:
     return (
-        candidate.rival_rad >= LEAST_RIVAL_RAD
-        and candidate.wrong_share <= MOST_WRONG_SHARE
+        candidate.wrong_share <= MOST_WRONG_SHARE
         and candidate.expected_mm <= MOST_EXPECTED_SHARE * rig.standoff_m * MM_PER_M
     )

@@ -33,6 +33,9 @@ FLAT_TURNS = 0.05
 LEFT_WRONG = 0.2
 """Of the wrong orders of single pixels, those that neighbours leave: measured 0.1 to 0.4
 (docs/results/crossed.md)."""
+LEAST_RIVAL_RAD = 0.15
+"""Phase of the nearest rival order of a pair that is proposed: three times what crossed fringes'
+phases are off by in a clean image. Nearer ones are chosen for any noise."""
 _PLACES = np.linspace(0.0, 1.0, 400)
 
 
@@ -220,7 +223,8 @@ def square_pair(lines: EpipolarLines, pitch_px: float) -> Crossed:
 
 def search(rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = None) -> Design:
     """The best `square_pair` of all ``pitches_px``, by default all whole numbers that the image can
-    hold: the one of the least expected error. Raises `RigError` where the limits leave none."""
+    hold: the one of the least expected error of those without a rival nearer than `LEAST_RIVAL_RAD`.
+    Raises `RigError` where the limits leave none."""
     lines, (least, most) = EpipolarLines.of(rig), assumed.image_px
     longest = int(math.hypot(rig.projector.width, rig.projector.height))
     pitches = [
@@ -246,7 +250,15 @@ def search(rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = 
             f"{rig.camera.height} px; give other --pitches, or wider limits (--image-px)"
         )
     searched = tuple(describe(rig, families, assumed))
-    return Design(min(searched, key=lambda candidate: round(candidate.expected_mm, 9)), searched)
+    apart = [candidate for candidate in searched if candidate.rival_rad >= LEAST_RIVAL_RAD]
+    if not apart:
+        nearest_rad = max(candidate.rival_rad for candidate in searched)
+        raise RigError(
+            f"each of {len(searched)} periods has a wrong order within {nearest_rad:.2g} rad of the "
+            f"right one somewhere in the range, and {LEAST_RIVAL_RAD:g} rad are needed; shorten the "
+            f"working range, or allow other periods (--pitches, --image-px)"
+        )
+    return Design(min(apart, key=lambda candidate: round(candidate.expected_mm, 9)), searched)
 
 
 @styled

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.design.rigs import (
-    LEAST_RIVAL_RAD,
     axes_deg,
     broken_rule,
     coverage,
     drawn_rig,
 )
-from fpp_ml_bench.design.search import Assumptions, describe
+from fpp_ml_bench.design.search import LEAST_RIVAL_RAD, Assumptions, describe
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict

@@ -184,3 +184,14 @@ def test_a_projector_that_looks_away_is_refused():
     )
     with pytest.raises(RigError, match="no pixel sees the pattern"):
         EpipolarLines.of(away)
+
+
+def test_a_pair_with_a_rival_too_near_is_not_proposed() -> None:
+    """Over 0.6 to 3.1 m the finest periods have wrong orders within 0.15 rad; a coarser one has
+    none."""
+    deep = replace(PAPER, working_range_mm=(600.0, 3100.0))
+    found = search(deep, Assumptions(), (8.0, 10.0, 12.0))
+    assert [candidate.rival_rad < 0.15 for candidate in found.searched] == [True, True, False]
+    assert found.proposed is found.searched[2]
+    with pytest.raises(RigError, match="each of 2 periods has a wrong order within 0.13 rad"):
+        search(deep, Assumptions(), (8.0, 10.0))
