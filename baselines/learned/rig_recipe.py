@@ -85,7 +85,7 @@ class RigRecipe(StepRecipe):
     no_plane: float = 0.15
     weight_phase: float = 10.0
     weight_scale: float = 0.1
-    weight_mask: float = 0.5
+    weight_mask: float = 2.0
 
     family: ClassVar[Family] = FRINGE_NETWORKS
     main_loss: ClassVar[str] = "phase"
