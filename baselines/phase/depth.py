@@ -113,7 +113,7 @@ TEXTURE_RAD = 0.5
 fringes was seen."""
 AMBIGUOUS_CHANCE = 0.3
 """Chance of a wrong order above which a pixel of crossed fringes is AMBIGUOUS. Its depth stays."""
-LEAST_GREY = 0.5
+FLOOR_GREY = 0.5
 """Least brightness, in grey levels, that a change is divided by: it keeps the phase correction of
 black pixels finite."""
 SYSTEMATIC_SHARE = 0.08
@@ -299,7 +299,7 @@ def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
     brightness, change, share, curvature = tied_fit([view], seen.inside, window, CURVED)
     share = np.maximum(share, 1e-6)
     curvature = np.maximum(curvature / share, 1e-3)
-    bright = np.maximum(brightness, LEAST_GREY)
+    bright = np.maximum(brightness, FLOOR_GREY)
     nearness = (
         nearness
         + np.clip(change / bright, -LARGEST_STEP_RAD, LARGEST_STEP_RAD) / carriers.joint_gain
@@ -334,7 +334,7 @@ def _of_best_sides(seen: CrossedObservation, fit: NearnessFit) -> NearnessFit:
 def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessFit:
     """The same from the phase and modulation that every pixel measured itself in three frames."""
     carriers, modulation, contrast = seen.carriers, seen.modulation[moved], seen.contrast[moved]
-    gain, bright = carriers.gain[moved], np.maximum(modulation, np.float32(LEAST_GREY * contrast))
+    gain, bright = carriers.gain[moved], np.maximum(modulation, np.float32(FLOOR_GREY * contrast))
     noise_grey = phase_noise_grey(nearness * gain, bright, seen.inside)
     # Least squares of three equal steps: both amplitudes have 2 / 3 of the variance of a grey
     # level.

@@ -81,7 +81,7 @@ light was computed for these once, and is computed again for others."""
 NARROWING_RAD = (0.3, 0.2, 0.2, 0.2)
 """Distances from the corrected phases, in place of `SAME_RAD`, round by round: a flat object may be
 near the plane."""
-MARGIN_PERIODS = 0.4
+ERODED_PERIODS = 0.4
 """Width, in periods, that is eroded from the pixels that show the plane: a window beside an object
 covers the object too."""
 PLAIN_SIGMAS = 5.0
@@ -101,7 +101,7 @@ not exact."""
 SAMPLES = 4000
 """About how many points the plane is fitted to: enough to average the noise out, few enough to
 solve in ms."""
-ROUNDS = 4
+OUTLIER_ROUNDS = 4
 """Rounds of a fit that leaves out outliers. Each measures the noise again without the outliers of
 the round before; more rounds cost time."""
 OUTLIER_SIGMAS = 4.0
@@ -315,7 +315,7 @@ class CrossedEmptyScene:
             carriers.rig.background_m is not None,
         )
         self._period_px = carriers.period_px
-        self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
+        self._margin = 2 * max(1, round(ERODED_PERIODS * carriers.period_px / stride)) + 1
         phases = self._phases()
         self._grid_rad = wrapped(phases[:, ::stride, ::stride]).astype(np.float32)
         self._grid = _linear(carriers.rig)[
@@ -473,7 +473,7 @@ def _most_common(off_rad: NDArray) -> NDArray[np.float32]:
 
 
 def _least_squares(
-    terms: NDArray[np.float64], values: NDArray[np.float64], rounds: int = ROUNDS
+    terms: NDArray[np.float64], values: NDArray[np.float64], rounds: int = OUTLIER_ROUNDS
 ) -> tuple[NDArray, NDArray]:
     """Least squares, in more than one of the ``rounds`` without outliers: the fitted values and the
     solution."""

@@ -43,7 +43,7 @@ clearly not explain the gap."""
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette, in periods, within which a pixel may change between
 object and background."""
-LARGEST_MISFIT = 0.35
+LARGEST_MISFIT_POWER = 0.35
 """Largest mean square of the misfit of a fringe that is there, as a share of the mean square of its
 light. A dark hollow into which only the fit's window reaches exceeds it."""
 OBJECT_BONUS = 4.0
@@ -228,7 +228,7 @@ def explained(grey: Image, predicted: Image, ambient_grey: float, period_px: flo
     sigma_px = RING_PERIODS * period_px
     light = predicted - np.float32(ambient_grey)
     misfit, power = (cv2.GaussianBlur(v * v, (0, 0), sigma_px) for v in (grey - predicted, light))
-    return misfit < LARGEST_MISFIT * power  # type: ignore[no-any-return]
+    return misfit < LARGEST_MISFIT_POWER * power  # type: ignore[no-any-return]
 
 
 def refined(

@@ -111,7 +111,7 @@ MOST_SLACK_PERIODS = 0.07
 """Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, where
 `SLACK_SHARE` is less, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost
 every pixel have a second order."""
-LEAST_CONTRAST = 0.08
+LEAST_CARRIER_CONTRAST = 0.08
 """Least contrast (modulation over mean) of a carrier on the object that a measurement may give: a
 fit with less would hardly see the carrier."""
 FAINT_SIGMAS = 6.0
@@ -577,7 +577,7 @@ class TwoCarriers(MeasurementModel):
             return self.carriers.family.weights
         shares = np.median(modulation[:, inner] / mean_grey[inner], axis=1)
         least, most = (
-            np.float32(LEAST_CONTRAST),
+            np.float32(LEAST_CARRIER_CONTRAST),
             np.asarray(self.carriers.family.weights, np.float32),
         )
         first, second = np.clip(shares, least, most).tolist()

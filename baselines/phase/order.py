@@ -101,7 +101,7 @@ is."""
 NECK_PERIODS = 0.25
 """Half the width of the narrowest connection between parts of a surface. Along a depth edge the
 jump is a whole number of periods here and there, and looks continuous; such places are short."""
-LEAST_AREA_PERIODS = 0.5
+LEAST_SETTLED_AREA_PERIODS = 0.5
 """Area, in squares of one period, of the smallest surface whose order the range may settle. A
 smaller surface stays ambiguous, or continues a settled one."""
 OUT_SHARE = 0.05
@@ -378,7 +378,7 @@ def margin_by_range(seen: Observation, order: NDArray[np.int32]) -> Image:
     cores = cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, neck)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(cores, connectivity=4)
     areas = stats[:, cv2.CC_STAT_AREA]
-    settled = areas >= LEAST_AREA_PERIODS * square
+    settled = areas >= LEAST_SETTLED_AREA_PERIODS * square
     settled[0] = False
     for rival in (
         -1,
