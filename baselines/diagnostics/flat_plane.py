@@ -36,7 +36,8 @@ from fpp_ml_bench.style import DEPTH_COLOURS, Picture, gallery
 from fpp_ml_bench.tables import Table
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
-"""Tilts of the planes, in degrees about x and y: facing, and clearly tilted each way."""
+"""Tilts of the planes across and down, in degrees: facing the camera, and clearly tilted each
+way."""
 DISTANCES_M = (1.6, 1.8, 2.0)
 """Distances of the planes, in m: around the paper's standoff, within its range."""
 OUTLINES = 5

@@ -52,7 +52,7 @@ SEEDS = 2
 """Seeds of the probes, and networks of random weights: two show whether a score depends on the
 seed."""
 BATCH = 4
-"""Samples in a training step: few, so that the few samples give many steps."""
+"""Samples in a training step. A larger batch gives fewer steps in the same passes."""
 PIXELS = 1024
 """Pixels drawn with replacement from each sample: so many over the image, and as many within the
 object."""
@@ -64,8 +64,8 @@ RIDGE = 1e-6
 """Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels
 solvable."""
 WIDTH = 16
-"""Channels of a four-convolution probe: small, so that it reads a layer and does not learn the
-task."""
+"""Channels of a four-convolution probe. A wider probe learns more of the task by itself, and tells
+less of the layer."""
 LEARNING_RATE = 3e-3
 """Adam's learning rate for these probes, which falls to 0 along a cosine."""
 TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
@@ -95,7 +95,8 @@ LINEAR: Targets = {
 }
 """Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so
 has two maps."""
-FRINGE = ("phase", "order")  # of these, what needs fringes of a single direction
+FRINGE = ("phase", "order")
+"""Targets that need fringes of a single direction."""
 SPATIAL: Targets = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
 """Of the four-convolution probes, which are trained on the maps of the whole image."""
 

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 
 DISTANCES_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
+"""Distances of the object in m at which theory is compared with the rig: from much nearer to much
+farther than the paper's 1.8 m."""
 SHOWN_M = 1.8
 """Distance in m that the summary shows: the paper's standoff, 1.8 m."""
 SMALL_PERIODS = 1 / 64

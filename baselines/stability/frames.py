@@ -42,6 +42,8 @@ MODULATION = 100.0
 PLANE_M = 1.8
 """Distance of the cases' plane in m: the paper's standoff."""
 MODULATIONS = (100.0, 30.0, 10.0, 5.0, 1.0, 0.1)
+"""Modulations in grey levels: from a bright fringe, across the decoder's limit of 5, to less than a
+grey level."""
 
 
 def phases(count: int = 720) -> Floats:

@@ -52,8 +52,8 @@ AGREEMENT_GREY = 3.0
 """Largest residual of the other frames' means. Above it, the scene does not follow the model (a
 strong gamma on a few pixels), and no frame is reported."""
 LEAST_STEPS_FOR_MEANS = 7
-"""Steps from which on means are tested: with fewer, too few of the other frames are left to tell
-which one is wrong."""
+"""Steps from which on means are tested. With fewer, too few other frames tell which one is wrong,
+and only a black frame is looked for."""
 OPPOSITE_SPAN_GREY = 40
 """A correct frame is black only where all phases are within 0.2 rad of its minimum; the frame half
 a period later then spans at most a fifth of the modulation."""

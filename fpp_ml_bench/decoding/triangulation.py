@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from fpp_ml_bench.decoding.decode import Decoded
 
 FIXED_POINT_STEPS = 50
-"""Most steps of the iteration that removes the projector's distortion. Usual lenses need far fewer;
-a coordinate that is not steady then gets no depth."""
+"""Most steps of the iteration that removes the projector's distortion. A coordinate that is not
+steady after them gets no depth."""
 FIXED_POINT_TOLERANCE = 1e-13
 """Largest last change, in normalised units, of a projector coordinate after its distortion was
 removed by iteration."""

@@ -30,6 +30,7 @@ RAYS = 64
 """From each surfel. A point's light comes from several surfels, so their noise is small
 (docs/light.md)."""
 _PLASTIC_SQUARED = 0.5698402909980532
+"""Square of `PLASTIC`: the second of two steps that spread points evenly over a square."""
 _OFFSET_M = 1e-5
 """Distance in m by which a ray starts off its surfel, so that it does not meet its own surface by
 rounding."""
