@@ -20,17 +20,27 @@ NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
 RangeRule = Literal["object", "valid"]
 """The pixels over which a sample's depth range is taken: all of the object, as in the paper, or
 those not void."""
-NODATA_SHARE, NODATA_LEAST_PX = 0.01, 30
-"""Share of a map's pixels, and pixels, that must hold exactly the same value before it can be a
-mark for no surface. By reason, not by trial: wrong depths that differ from all others are single
+NODATA_SHARE = 0.01
+"""Share of a map's pixels that must hold exactly the same value before it can be a mark for no
+surface. By reason, not by trial: wrong depths that differ from all others are single pixels."""
+NODATA_LEAST_PX = 30
+"""Pixels that must hold it, whichever is more: in small maps the share alone would be a few
 pixels."""
-NODATA_FAR, NODATA_DECADE = 3.0, 10.0
-"""How many times farther than what can be measured such a mark is, and than other depths: a wall
-behind a scene may be twice as far, and the marks of renderers and sensors (9999, 65504, 65535,
-1e10) are beyond."""
+NODATA_FAR = 3.0
+"""How many times farther than what can be measured such a mark is: a wall behind a scene may be
+twice as far."""
+NODATA_DECADE = 10.0
+"""How many times farther than all other depths, or nearer, it is where that reach is unknown. The
+marks of renderers and sensors (9999, 65504, 65535, 1e10) are farther."""
 NODATA_ADVICE = "write 0 where no surface is, or give the value that says so as nodata"
 _BLOCK = 1 << 16
-_SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+"""Values in a block whose least and largest are taken at once: at most 512 KiB, which stay in the
+cache."""
+_SMALLEST = float(np.finfo(np.float32).tiny)
+"""Smallest span that is divided by in single precision, the smallest normal number of float32:
+below, float32 loses digits."""
+_LARGEST = float(np.finfo(np.float32).max)
+"""Largest number of float32: depths and spans beyond it are computed in float64."""
 
 
 def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:

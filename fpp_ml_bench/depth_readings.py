@@ -12,18 +12,22 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.optics.pinhole import Pinhole
 
-MOST_GLANCES, _FEW = 48, 8
-"""Samples that are compared with each other, and that are read in every way."""
+MOST_GLANCES = 48
+"""Samples, at most, that are compared with each other to find exchanged ones."""
+_FEW = 8
+"""Samples, at most, that are read in every way: eight arrangements with each unit and sign take
+time."""
 _LINES = 20
 """Rows and columns of a glance, about; twice as many where they are not symmetric by themselves."""
 _FEWER = 4.0
 """A reading is named where its error is so many times smaller than the one that was given. Chosen
 by reason: a network's error is 0.3 to 1 times that of a constant, and no other reading of a right
 map comes near the target."""
-_RAY_GAIN, _RAY_SLOPE = 0.75, 0.25
-"""Distances along rays are named where reading them so leaves at most this share of the error, and
-where the error grows as distances do, within this share of the slope: a constant offset has slope
-0."""
+_RAY_GAIN = 0.75
+"""Distances along rays are named where reading them so leaves at most this share of the error."""
+_RAY_SLOPE = 0.25
+"""And where the error grows as distances do, within this share of the slope: a constant offset has
+slope 0."""
 UNITS_MM = {
     "cm": 10.0,
     "dm": 100.0,

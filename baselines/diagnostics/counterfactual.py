@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
     from fpp_ml_bench.baselines.method import Method
 
-MARGIN_PX = 6  # around the objects in the picture
+MARGIN_PX = 6
+"""Margin around the objects in the picture, in px."""
 Map = NDArray[np.floating]
 
 

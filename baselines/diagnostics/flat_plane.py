@@ -36,8 +36,14 @@ from fpp_ml_bench.style import DEPTH_COLOURS, Picture, gallery
 from fpp_ml_bench.tables import Table
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
+"""Tilts of the planes across and down, in degrees: facing the camera, and clearly tilted each
+way."""
 DISTANCES_M = (1.6, 1.8, 2.0)
-OUTLINES, QUICK_OUTLINES = 5, 2
+"""Distances of the planes, in m: around the paper's standoff, within its range."""
+OUTLINES = 5
+"""Silhouettes of test objects that planes get: one for each object of the test split."""
+QUICK_OUTLINES = 2
+"""The same in a quick run."""
 FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
 KINDS = FRAME, RECTANGLE, SILHOUETTE
 """Kinds of outlines; a silhouette is named by its sample."""

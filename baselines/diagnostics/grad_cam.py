@@ -50,8 +50,13 @@ Correlations = Mapping[tuple[str, str], Mapping[int, Sequence[float | None]]]
 random weights."""
 
 PAPER = "grad_cam"
-SAMPLES, QUICK_SAMPLES = 30, 6
+SAMPLES = 30
+"""Test samples whose heatmaps are compared, spread over objects: all 30 of the full set."""
+QUICK_SAMPLES = 6
+"""The same in a quick run."""
 SEEDS = 2
+"""Networks of random weights that the trained one is compared with. More narrow the comparison;
+each takes as long as the trained one."""
 PLANES = {"plane_0.5": 0.5, "plane_0.8": 0.8}
 """Facing rectangles by their side, as a share of the image's. Our UNet takes the first for an
 object and the second, like the paper's its rectangle, for background."""
@@ -69,7 +74,10 @@ COLUMNS = {
 }
 """Titles of what is said of each layer."""
 _LEAST_SPREAD = 1e-12
+"""Product of standard deviations and pixels below which a map counts as constant, and has no
+correlation: rounding alone."""
 _EXAMPLES = 3
+"""Samples that the figure shows, spread over all: a row each."""
 
 
 class GradCam(Probe):

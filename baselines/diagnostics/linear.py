@@ -40,21 +40,34 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import INK, LINE, LINE_COLOURS, panels, styled, with_legend
 from fpp_ml_bench.tables import Table
 
-SAMPLES, QUICK_SAMPLES = 120, 24  # training samples of the probes
-EPOCHS, QUICK_EPOCHS = 6, 4
+SAMPLES = 120
+"""Training samples of the probes, spread over objects. More take more time."""
+QUICK_SAMPLES = 24
+"""The same in a quick run."""
+EPOCHS = 6
+"""Passes of the four-convolution probes over these samples."""
+QUICK_EPOCHS = 4
+"""The same in a quick run."""
 SEEDS = 2
+"""Seeds of the probes, and networks of random weights: two show whether a score depends on the
+seed."""
 BATCH = 4
+"""Samples in a training step. A larger batch gives fewer steps in the same passes."""
 PIXELS = 1024
 """Pixels drawn with replacement from each sample: so many over the image, and as many within the
 object."""
-SHARE, LONGEST = 4, 120
-"""Image px per grid step, and the most grid points along a side; for larger images the step
-grows."""
+SHARE = 4
+"""Image px per grid step: a grid of a sixteenth of the pixels saves time."""
+LONGEST = 120
+"""Most grid points along a side; for larger images the step grows."""
 RIDGE = 1e-6
 """Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels
 solvable."""
 WIDTH = 16
+"""Channels of a four-convolution probe. A wider probe learns more of the task by itself, and tells
+less of the layer."""
 LEARNING_RATE = 3e-3
+"""Adam's learning rate for these probes, which falls to 0 along a cosine."""
 TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
 INPUT, SILHOUETTE = "input", "silhouette"
 CONTROL_TITLES = {INPUT: "raw input", SILHOUETTE: "object's mask alone"}
@@ -82,7 +95,8 @@ LINEAR: Targets = {
 }
 """Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so
 has two maps."""
-FRINGE = ("phase", "order")  # of these, what needs fringes of a single direction
+FRINGE = ("phase", "order")
+"""Targets that need fringes of a single direction."""
 SPATIAL: Targets = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
 """Of the four-convolution probes, which are trained on the maps of the whole image."""
 

@@ -59,11 +59,15 @@ REPROJECTED: tuple[Projected, ...] = (
     "other direction",
     "other pitch",
 )
-PITCH_FACTOR = 4 / 3  # factor of the changed pitch: 18 px become 24
+PITCH_FACTOR = 4 / 3
+"""Factor of the changed pitch: 18 px become 24."""
 LARGEST_SHIFT_RAD = 0.4 * TAU
+"""Largest shift of the phase, in rad: less than half a period, so that the nearest order stays the
+moved one's own."""
 SMALLEST_SHIFT_RAD = 0.05 * TAU
 """Where the working range allows only smaller shifts, the move is left out."""
 VIEWS_PER_OBJECT = 2
+"""Views of each object that are changed: every change is rendered, which takes time."""
 GROWTH = 0.1
 """How far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half
 its area."""

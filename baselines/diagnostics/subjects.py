@@ -37,12 +37,17 @@ NORMALISATION_OF: dict[str, Normalisation] = {
 }
 """How a user's module represents depth, by its units."""
 BATCH = 8
+"""Most images in a batch."""
 PIXELS_AT_ONCE = BATCH * 224 * 224
-"""Most images in a batch, and most pixels: at 960 px a batch is one image."""
+"""Most pixels in a batch: at 960 px a batch is one image."""
 NORMALISED_BACKGROUND = 0.1
-SAMPLES_ASKED = 6  # to find out whether a model predicts anything
-_LEAST_SPREAD = 1e-3  # relative: predictions that differ by less are the same
-_STRAY = 0.001  # share of pixels at either end that may differ
+"""Normalised prediction below which a pixel is taken for background, which is 0."""
+SAMPLES_ASKED = 6
+"""Samples that show whether a model predicts anything at all."""
+_LEAST_SPREAD = 1e-3
+"""Relative difference of a model's predictions up to which they count as the same."""
+_STRAY = 0.001
+"""Share of pixels at either end that may differ from the others all the same."""
 Depth = NDArray[np.float32]
 
 

@@ -36,13 +36,19 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 
 DISTANCES_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
-SHOWN_M = 1.8  # in the summary
-SMALL_PERIODS = 1 / 64  # an error so small that the linear model holds over all distances
+"""Distances of the object in m at which theory is compared with the rig: from much nearer to much
+farther than the paper's 1.8 m."""
+SHOWN_M = 1.8
+"""Distance in m that the summary shows: the paper's standoff, 1.8 m."""
+SMALL_PERIODS = 1 / 64
+"""An error so small, in periods, that the linear model holds over all distances."""
 ERRORS_PERIODS = {"1/64 period": SMALL_PERIODS, "a period, away": 1.0, "a period, toward": -1.0}
 STARTS_PERIODS = (0.0, -1.0, -0.5)
 """Position of the first of two scenes that are a period apart, in periods from the object's own
 position."""
-_STEP = 1e-4  # relative step of distance in a difference quotient
+_STEP = 1e-4
+"""Relative step of the distance in a difference quotient: far above rounding, far below what
+changes the slope."""
 
 
 class Theory(Probe):

@@ -25,13 +25,24 @@ from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Ob
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics.rig import Rig
 
-LEAST_GREY = 0.1  # least brightness, in grey levels, whose logarithm is taken
-JUMP_RAD_PER_PX, JUMP_LOG_PER_PX = 0.1, 0.06
-"""Change of residual phase, and of log brightness, from which on two neighbours with a phase of
-their own lie on two surfaces."""
-JUMP_WEIGHT = 0.05  # weight of the link between two such neighbours
-WELL_LIT = 8.0  # modulation over noise from which on a window's phase counts fully
+LEAST_GREY = 0.1
+"""Least brightness, in grey levels, whose logarithm is taken: a tenth of a level, so that black
+pixels give a finite number."""
+JUMP_RAD_PER_PX = 0.1
+"""Change of the residual phase per px from which on two neighbours lie on two surfaces. Used only
+where every pixel has a phase of its own. A smaller limit cuts steep surfaces apart."""
+JUMP_LOG_PER_PX = 0.06
+"""Change of the log brightness per px from which on two such neighbours lie on two surfaces. A
+smaller limit cuts shaded or textured surfaces apart."""
+JUMP_WEIGHT = 0.05
+"""Factor on the link between two such neighbours. Above 0, so that a pixel between two jumps still
+follows its neighbours a little."""
+WELL_LIT = 8.0
+"""Modulation over the image's noise from which on a window's phase counts fully as evidence. Below
+it, the weight falls in proportion."""
 LEAST_TRUST = 0.05
+"""Least weight, 0 to 1, of the evidence at a point. Above 0, so that evidence in the dark still
+decides where no neighbour does."""
 
 
 @dataclass(frozen=True)

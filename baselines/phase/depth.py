@@ -57,43 +57,76 @@ from fpp_ml_bench.coding.crossed import WINDOW_PERIODS
 from fpp_ml_bench.coding.phase_shift import phase_weights
 from fpp_ml_bench.constants import MM_PER_M
 
-HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
+HALF_CONFIDENCE_MM = 5.0
+"""Expected error, in mm, at which the confidence is a half. It scales the confidence and leaves the
+ranking of pixels as it is."""
 SATURATED_SHARE = 0.02
+"""Share of a pixel's window that may be clipped. Above it the reason is SATURATED; the depth
+stays."""
 LEAST_MARGIN = 0.1
 """Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the
 rival order out."""
-MARGIN_SCALE = 0.04  # margin by which the odds of two orders grow e-fold
-MISFIT_SHARE, UNKNOWN_MISFIT_SHARE = 0.3, 0.75
-"""Phase error of a local fit as a share of its relative misfit: on the benchmark's objects, and
-where no known background shows, so that light and surface may be any (a real skull,
-`docs/results/phase_route.md`)."""
-SLOWEST, FASTEST = 0.35, 2.2
-"""Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window
-resolves."""
+MARGIN_SCALE = 0.04
+"""Margin by which the odds of two orders grow e-fold. A larger scale gives clear choices a larger
+chance of a wrong order, and so a larger expected error."""
+MISFIT_SHARE = 0.3
+"""Phase error of a local fit as a share of its relative misfit, on the benchmark's objects."""
+UNKNOWN_MISFIT_SHARE = 0.75
+"""The same share where no known background shows, so that light and surface may be any: chosen on
+an image of a real skull (`docs/results/phase_route.md`)."""
+SLOWEST = 0.35
+"""Least fringe frequency in the image that a window resolves, as a multiple of that of a plane
+square to the axis: below it, a window of a fixed size holds too little of a period."""
+FASTEST = 2.2
+"""Largest such frequency that a window resolves: above it, the fringe changes too much within the
+window for the linear fit of the phase."""
 THIN_PERIODS = 0.5
-EVIDENCE_SCALE, ENERGY_SCALE, EVEN_ODDS = 1.0, 4.0, 0.8
-"""By how much evidence and margin of energy of two carriers the odds of two orders grow e-fold, and
-where they are even."""
-LEAST_WRONG, MOST_WRONG = 0.01, 0.32
-"""Chances of a wrong order between which the rival widens the stated uncertainty. Below, it lies
-outside of the widest interval in use (99%). The variance of both orders together would state
-several mm for a chance of 0.1%, at pixels whose error is a tenth of that."""
-LOST_SHARE, LOST_CHANCE = 0.25, 0.6
-"""Share of a carrier's contrast below which it counts as not seen, and the least probability of a
-wrong order then."""
-TEXTURE_SHARE = 0.35  # rms misfit over brightness of a window that shows no crossed fringe
+"""Least width of an object, in periods, that is not THIN: a window next to a narrower part covers
+both of its sides."""
+EVIDENCE_SCALE = 1.0
+"""Difference of the evidence's cost by which the odds of two orders of crossed fringes grow e-fold.
+The costs are squared sigmas over 2, that is log-odds, so the scale is 1."""
+ENERGY_SCALE = 4.0
+"""Difference of the energy by which these odds grow e-fold. Larger than that of the evidence: the
+energy counts jumps to neighbours too, and not the pixel's evidence alone."""
+EVEN_ODDS = 0.8
+"""Sum of both scaled differences at which the two orders are equally likely. A larger number states
+more doubt at every pixel."""
+LEAST_WRONG = 0.01
+"""Least chance of a wrong order for which the rival widens the uncertainty; below, it lies outside
+of the widest interval in use (99%). The variance of both orders would state several mm for a chance
+of 0.1%, at pixels whose error is a tenth of that."""
+MOST_WRONG = 0.32
+"""Largest chance that is used: at 0.32 the interval that just reaches the rival is one standard
+deviation (68%), so the stated uncertainty is at most the distance to the rival."""
+LOST_SHARE = 0.25
+"""Share of a carrier's contrast below which it counts as not seen. A larger share calls dark or
+blurred surfaces ONE_DIRECTION."""
+LOST_CHANCE = 0.6
+"""Least probability of a wrong order where a carrier is not seen: more than a half, since one
+carrier alone does not tell the order."""
+TEXTURE_SHARE = 0.35
+"""Largest rms misfit over brightness of a window that shows crossed fringes; above it the reason is
+TEXTURE."""
 TEXTURE_RAD = 0.5
-"""Distance of both phases from the depth's at which something else than its fringes was seen."""
-AMBIGUOUS_CHANCE = 0.3  # of a wrong order
-LEAST_GREY = 0.5  # least brightness that a change is divided by
-SYSTEMATIC_SHARE, RIM_SHARE = 0.08, 0.6
-"""Of the power of a misfit that is no noise, what acts as an error of the phase: everywhere, and
-more by the share of the window that lies beyond the object. So that 68% intervals hold 68% of the
-pixels of validation views."""
+"""Distance of both phases, in rad, from those of the depth, above which something else than its
+fringes was seen."""
+AMBIGUOUS_CHANCE = 0.3
+"""Chance of a wrong order above which a pixel of crossed fringes is AMBIGUOUS. Its depth stays."""
+FLOOR_GREY = 0.5
+"""Least brightness, in grey levels, that a change is divided by: it keeps the phase correction of
+black pixels finite."""
+SYSTEMATIC_SHARE = 0.08
+"""Share of the power of a misfit beyond noise that acts as a phase error everywhere. Set so that
+68% intervals hold 68% of the pixels of validation views."""
+RIM_SHARE = 0.6
+"""What is added to that share by the part of the window beyond the object. Set in the same way."""
 NOT_AVERAGED = 0.2
-"""Of the noise of a pixel's own phase, what the mean over pixels leaves beside its noise: noise
-hides how far they are from a plane."""
+"""Of the noise of a pixel's own phase, the share that the mean over pixels leaves in addition to
+its own noise: noise hides how far the pixels are from a plane."""
 NOISE_SIGMAS = 3.0
+"""Misfit of the brightness, in standard deviations of its noise, that noise explains: beyond three,
+1 in 370 pixels has such noise."""
 OWN_SYSTEMATIC_SHARE = 0.15
 """Phase error as a share of a misfit of the brightness that noise does not explain."""
 
@@ -266,7 +299,7 @@ def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
     brightness, change, share, curvature = tied_fit([view], seen.inside, window, CURVED)
     share = np.maximum(share, 1e-6)
     curvature = np.maximum(curvature / share, 1e-3)
-    bright = np.maximum(brightness, LEAST_GREY)
+    bright = np.maximum(brightness, FLOOR_GREY)
     nearness = (
         nearness
         + np.clip(change / bright, -LARGEST_STEP_RAD, LARGEST_STEP_RAD) / carriers.joint_gain
@@ -301,7 +334,7 @@ def _of_best_sides(seen: CrossedObservation, fit: NearnessFit) -> NearnessFit:
 def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessFit:
     """The same from the phase and modulation that every pixel measured itself in three frames."""
     carriers, modulation, contrast = seen.carriers, seen.modulation[moved], seen.contrast[moved]
-    gain, bright = carriers.gain[moved], np.maximum(modulation, np.float32(LEAST_GREY * contrast))
+    gain, bright = carriers.gain[moved], np.maximum(modulation, np.float32(FLOOR_GREY * contrast))
     noise_grey = phase_noise_grey(nearness * gain, bright, seen.inside)
     # Least squares of three equal steps: both amplitudes have 2 / 3 of the variance of a grey
     # level.

@@ -27,16 +27,23 @@ from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.optics.rig import Rig
 
 SAMPLE_STEP_PX = 5
-LEAST_SHARE = 0.02  # of the image that must show the plane for the image to calibrate itself
+"""Distance in px of the pixels to which light is fitted. Every fifth along both axes is 4% of an
+image, which saves time and leaves many more samples than unknowns."""
+LEAST_SHARE = 0.02
+"""Least share of the image that must show the plane for the image to calibrate itself. With less,
+nothing is fitted, and no plane is predicted."""
 DARK_PERCENTILE = 1.0
-"""Of the grey levels of an image without background that is taken for its ambient light."""
-DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measure it on
+"""Percentile of the grey levels of an image without background that is taken for its ambient light.
+The least value itself would be noise."""
+DEFAULT_NOISE_GREY = 1.0
+"""Least noise, in grey levels, of an image that shows no background to measure it on: the noise
+that `MIN_MODULATION` counts with."""
 DIFFERENT_SIGMAS = 3.5
 """A pixel this far from the empty scene is not background; noise alone reaches it at isolated
 pixels, 1 in 2,000."""
 TILE_PX_PER_PERIOD = 1.1
-"""Side of the tiles that are searched for the plane: over one period, to separate strength and
-ambient light."""
+"""Side of the tiles that are searched for the plane, in periods: over one period, to separate
+strength and ambient light."""
 TILE_NOISE_SIGMAS = 3.0
 """Largest misfit of a tile that may be background, in standard deviations of the image's noise."""
 STRENGTH_TOLERANCE = 0.4
@@ -50,32 +57,59 @@ where it is as dim as noise."""
 SAME_STRENGTH = 1.35
 """Ratio of strengths within which tiles show the same surface: sheen changes slowly over a
 plane."""
-SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel may show it
-MOVED_RAD, MOVED_CELLS, MOVED_SHARE = 1.0, 10, 0.1
-"""Farthest distance, along each axis, of the plane's phases from those of the rig: a calibration
-that is off, or a wall that stands elsewhere. Cells along each axis in which it is looked for; share
-of the image that must agree on it."""
-CLEAR_SHARE, MORE = 0.5, 1.5
-"""Share of the image that has the rig's own phases from which on no other place is looked for; how
-many times as many points another place must have."""
-EXACT_RAD = 0.05  # distance that is not corrected
+SAME_RAD = 0.4
+"""Distance, in rad, of a pair of phases from the plane's pair within which a pixel may show the
+plane."""
+MOVED_RAD = 1.0
+"""Farthest distance in rad, along each axis, of the plane's phases from those of the rig: a
+calibration that is off, or a wall that stands elsewhere."""
+MOVED_CELLS = 10
+"""Cells along each axis in which that distance is looked for. Each is 0.2 rad wide, half of
+`SAME_RAD`."""
+MOVED_SHARE = 0.1
+"""Least share of the image that must agree on another place of the plane. Less may be a flat
+object."""
+CLEAR_SHARE = 0.5
+"""Share of the image that has the rig's own phases from which on no other place of the plane is
+looked for: at a half, another place can hardly have more."""
+MORE = 1.5
+"""How many times as many points another place of the plane must have. Above 1, so that the rig's
+own place is kept in a close case."""
+EXACT_RAD = 0.05
+"""Largest distance of the plane's phases from the rig's, in rad, that is left as it is: the plane's
+light was computed for these once, and is computed again for others."""
 NARROWING_RAD = (0.3, 0.2, 0.2, 0.2)
 """Distances from the corrected phases, in place of `SAME_RAD`, round by round: a flat object may be
 near the plane."""
-MARGIN_PERIODS = 0.4  # eroded from those pixels: a window beside an object covers it too
+ERODED_PERIODS = 0.4
+"""Width, in periods, that is eroded from the pixels that show the plane: a window beside an object
+covers the object too."""
 PLAIN_SIGMAS = 5.0
 """Spread of the plane's fitted light, over the noise, below which it shows no fringe."""
 TEXTURED = 3.0
 """Misfit of the plane over the frame's noise from which on its albedo is taken to change from place
 to place."""
-ALBEDO_PERIODS, ALBEDO_SIDES = 0.27, 0.5
-"""In periods: sigma of the window in which an albedo is measured, and how far away the albedo of a
-side is taken."""
-ALBEDO_SHARE = 0.03  # of the plane's light that counts as noise where its albedo changes
-SAMPLES = 4000  # points to which the plane is fitted, about
-ROUNDS = 4
+ALBEDO_PERIODS = 0.27
+"""Sigma, in periods, of the window in which the albedo of a textured plane is measured: it covers
+about a period, so that it averages over the fringe."""
+ALBEDO_SIDES = 0.5
+"""Distance, in periods, at which the albedo of each side of a pixel is taken, for a pixel beside an
+edge of the print."""
+ALBEDO_SHARE = 0.03
+"""Share of the plane's light that counts as noise where its albedo changes: the measured albedo is
+not exact."""
+SAMPLES = 4000
+"""About how many points the plane is fitted to: enough to average the noise out, few enough to
+solve in ms."""
+OUTLIER_ROUNDS = 4
+"""Rounds of a fit that leaves out outliers. Each measures the noise again without the outliers of
+the round before; more rounds cost time."""
 OUTLIER_SIGMAS = 4.0
-RESPONSE_POWERS = (2, 3)  # of the pattern, whose sum is what a projector of any gamma shows
+"""Misfit, in standard deviations of the noise, from which on a point is left out of the next round:
+normal noise reaches it in 1 of 16,000 points."""
+RESPONSE_POWERS = (2, 3)
+"""Powers of the pattern that are fitted beside the pattern itself: a projector's gamma bends the
+pattern before the light falls off."""
 CURVE_POWERS = (1, 2, 3)
 """Powers of the fitted light whose sum is the plane's grey level: a gamma of projector or camera
 bends it."""
@@ -281,7 +315,7 @@ class CrossedEmptyScene:
             carriers.rig.background_m is not None,
         )
         self._period_px = carriers.period_px
-        self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
+        self._margin = 2 * max(1, round(ERODED_PERIODS * carriers.period_px / stride)) + 1
         phases = self._phases()
         self._grid_rad = wrapped(phases[:, ::stride, ::stride]).astype(np.float32)
         self._grid = _linear(carriers.rig)[
@@ -439,7 +473,7 @@ def _most_common(off_rad: NDArray) -> NDArray[np.float32]:
 
 
 def _least_squares(
-    terms: NDArray[np.float64], values: NDArray[np.float64], rounds: int = ROUNDS
+    terms: NDArray[np.float64], values: NDArray[np.float64], rounds: int = OUTLIER_ROUNDS
 ) -> tuple[NDArray, NDArray]:
     """Least squares, in more than one of the ``rounds`` without outliers: the fitted values and the
     solution."""

@@ -19,25 +19,42 @@ from fpp_ml_bench.baselines.phase.geometry import Crop, Image, Mask, wrapped
 from fpp_ml_bench.coding.code import MIN_MODULATION
 
 CLOSING_PERIODS = 0.27
-ENCLOSED_PERIODS, ENCLOSED_WINDOW_PERIODS, ENCLOSED_EXCESS = 0.6, 0.2, 1.0
-"""Radius of the closing whose pixels join the object where the mean square of the plane's misfit,
-in a window of this sigma, exceeds that of noise by this multiple: seven standard deviations of such
-a mean at 15 px a period."""
+"""Radius of the closing, in periods, that fills the stripes where object and plane are equally
+bright. A stripe returns every half a period, so a quarter fills it."""
+ENCLOSED_PERIODS = 0.6
+"""Radius, in periods, of the wider closing within which dark parts of an object in a noisy frame
+are looked for."""
+ENCLOSED_WINDOW_PERIODS = 0.2
+"""Sigma, in periods, of the window in which the mean square of the plane's misfit is taken
+there."""
+ENCLOSED_EXCESS = 1.0
+"""Excess of that mean square over the noise's own, as a multiple of it, from which on a pixel joins
+the object: seven standard deviations of such a mean at 15 px a period."""
 BORDER_PERIODS = 0.6
-"""Width of the image's border, where blur mixes in what no pixel shows; no object is there
-alone."""
-GAP_PX, GAP_PLANE, GAP_OBJECT = 0.8, 4.0, 16.0
-"""Sigma of the average in which a gap in the object is told, the largest mean square of the plane's
-misfit there over that of noise, and the least of the object's."""
+"""Width of the image's border in periods, where blur mixes in what no pixel shows; no object lies
+there alone."""
+GAP_PX = 0.8
+"""Sigma, in px, of the average in which a gap in the object is told from the object."""
+GAP_PLANE = 4.0
+"""Largest mean square of the plane's misfit in a gap, over that of noise."""
+GAP_OBJECT = 16.0
+"""Least mean square of the object's misfit in a gap, over that of noise: the object's fringe must
+clearly not explain the gap."""
 RING_PERIODS = 0.14
-"""Distance from the first mask's silhouette within which a pixel may change between object and
-background."""
-LARGEST_MISFIT = 0.35  # of a fringe that is there, squared, as a share of its own square
+"""Distance from the first mask's silhouette, in periods, within which a pixel may change between
+object and background."""
+LARGEST_MISFIT_POWER = 0.35
+"""Largest mean square of the misfit of a fringe that is there, as a share of the mean square of its
+light. A dark hollow into which only the fit's window reaches exceeds it."""
 OBJECT_BONUS = 4.0
 """Added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is
 object."""
 UNLIT_PERIODS = 0.8
-UNLIT_SIGMAS = 4.0  # brightest grey level, above ambient light, of what counts as unlit
+"""Side, in periods, of the square whose dark stripes are filled before light is judged: most of a
+period, since a dark stripe of a fringe is half a period wide."""
+UNLIT_SIGMAS = 4.0
+"""Brightest grey level of what counts as unlit, above ambient light, in standard deviations of
+noise. More would drop dimly lit surfaces."""
 DARKEST_GREY = MIN_MODULATION / 4
 """An object pixel with less modulation has no fringe: it lies in shadow or faces away, and gets no
 depth."""
@@ -46,18 +63,33 @@ LEAST_AREA_PERIODS = 0.1
 PLANE_CHANCE_SIGMAS = 4.0
 """How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the
 empty plane."""
-PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
-SEAM_PX = 2  # half the width of a seam along a shadow, and of a rim
-UNLIT_PX = 3  # side of the square that is averaged to tell faint light
-SQUARE_PX = 5  # side of the square over which faint differences are averaged
+PLANE_TOLERANCE_GREY = 0.3
+"""Error of the fitted empty scene in grey levels, which is added to the noise."""
+SEAM_PX = 2
+"""Half the width, in px, of a seam along a shadow, and of a rim: the camera's blur mixes two
+surfaces over a few px."""
+UNLIT_PX = 3
+"""Side, in px, of the square that is averaged to tell faint light from noise."""
+SQUARE_PX = 5
+"""Side, in px, of the square over which faint differences are averaged. A larger one finds fainter
+objects, and loses parts that are narrower than it."""
 PIXELWISE_CLOSING_PERIODS = 0.2
+"""Radius of the closing in periods where every pixel was tested by itself. Several frames leave
+narrower stripes than one, so it is smaller than `CLOSING_PERIODS`."""
 ALIKE = 0.2
 """Largest relative difference from the brightness around of an object pixel that the empty scene
 explains as well."""
 SPECK_PX = 6
-"""Smallest group of pixels that counts as object, and largest hole in it that is closed."""
+"""Smallest group of pixels that counts as object, and largest hole in it that is closed, in
+pixels."""
 DARK_SIGMAS = 4.0
-CONTINUED_PX, CONTINUED_RAD = 3, 0.2
+"""Least modulation of an object pixel, in standard deviations of its noise, where the background is
+shown; more than `MIN_MODULATION` is never asked."""
+CONTINUED_PX = 3
+"""Object pixels among the eight around a pixel that make it continue the object: a pixel beside a
+straight rim has three."""
+CONTINUED_RAD = 0.2
+"""Difference of the residual phase, in rad, up to which such a pixel has the same phase."""
 
 
 def crop_around(region: Mask, margin_px: int, step: int = 1) -> Crop:
@@ -196,7 +228,7 @@ def explained(grey: Image, predicted: Image, ambient_grey: float, period_px: flo
     sigma_px = RING_PERIODS * period_px
     light = predicted - np.float32(ambient_grey)
     misfit, power = (cv2.GaussianBlur(v * v, (0, 0), sigma_px) for v in (grey - predicted, light))
-    return misfit < LARGEST_MISFIT * power  # type: ignore[no-any-return]
+    return misfit < LARGEST_MISFIT_POWER * power  # type: ignore[no-any-return]
 
 
 def refined(

@@ -76,35 +76,50 @@ from fpp_ml_bench.optics.rig import Rig
 
 Frames = NDArray | Sequence[NDArray]
 EVERYWHERE = (slice(None), slice(None))
-CROSSED_FRAMES = 3  # that shift one carrier
+CROSSED_FRAMES = 3
+"""Frames of crossed fringes that shift one carrier: three are the fewest that give its phase and
+modulation pixel by pixel."""
 MARGIN_PERIODS = 0.5
-"""Of the crop around the object: covers the windows, and the mask may grow into it."""
+"""Width of the crop around the object, in periods: it covers the windows, and the mask may grow
+into it."""
 FIRST_WINDOW_PERIODS = 0.35
 """Sigma of the window of the first fit, in periods. All windows were chosen on train and validation
 objects."""
 SECOND_WINDOW_PERIODS = 0.27
-"""Of the second fit, which starts from the phase of the first."""
+"""Sigma, in periods, of the window of the second fit, which starts from the phase of the first."""
 PAIR_WINDOW_PERIODS = 0.06
-"""Of the last fits to two frames, a few px."""
+"""Sigma, in periods, of the window of the last fits to two frames: a few px are enough, since two
+frames leave one unknown less."""
 SLOPE_PERIODS = 0.13
-"""Of the Gaussian under which slopes of the phase are averaged."""
+"""Sigma, in periods, of the Gaussian under which slopes of the phase are averaged."""
 SLACK_SHARE = 0.025
 """Of the range, by which it is widened at both ends where orders are chosen, for noise there: a
 depth beyond the range is left out, and no other order is taken to be within. 15 mm of the paper's
 600, where it was chosen on validation objects."""
 FRINGE_NOISE = 0.03
 """Uncertainty of a fringe extrapolated beyond its window, as a share of its brightness."""
-CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2
-"""Fits that measure the contrast of the fringes, and that use it."""
-PAIR_ROUNDS = 2  # fits to two frames over the small window
+CONTRAST_ROUNDS = 3
+"""Fits in a row that measure the contrast of the fringes, each from the phase and brightness of the
+one before. Each costs the time of a fit."""
+FREE_ROUNDS = 2
+"""Fits that use this contrast, and start from the carrier again, because a fit keeps the ripple of
+the phase that it starts from."""
+PAIR_ROUNDS = 2
+"""Fits to two frames over the small window. The second starts from the phase of the first, since
+the model is linear around its start."""
 MOST_SLACK_PERIODS = 0.07
 """Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, where
 `SLACK_SHARE` is less, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost
 every pixel have a second order."""
-LEAST_CONTRAST = 0.08
+LEAST_CARRIER_CONTRAST = 0.08
+"""Least contrast (modulation over mean) of a carrier on the object that a measurement may give: a
+fit with less would hardly see the carrier."""
 FAINT_SIGMAS = 6.0
-"""Modulation of a window below which light shows no fringe: a shadow that other light reaches."""
-CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
+"""Modulation of a window, in standard deviations of its noise, below which light shows no fringe: a
+shadow that other light reaches."""
+CONTRAST_RIM_PERIODS = 0.5
+"""Distance from the silhouette, in periods, within which grid points do not measure the contrast:
+their windows cover the background too."""
 
 
 @dataclass(frozen=True)
@@ -562,7 +577,7 @@ class TwoCarriers(MeasurementModel):
             return self.carriers.family.weights
         shares = np.median(modulation[:, inner] / mean_grey[inner], axis=1)
         least, most = (
-            np.float32(LEAST_CONTRAST),
+            np.float32(LEAST_CARRIER_CONTRAST),
             np.asarray(self.carriers.family.weights, np.float32),
         )
         first, second = np.clip(shares, least, most).tolist()

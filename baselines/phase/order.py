@@ -32,14 +32,20 @@ from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
 
-LARGE = np.float32(1e4)  # cost of a candidate that does not exist
+LARGE = np.float32(1e4)
+"""Cost of a candidate that does not exist: far above any sum of costs, and small enough to be added
+in float32."""
 EVIDENCE_PERIODS = 2.0
 """Side of the square over which evidence for an order is averaged: a single pixel's brightness is
 too uncertain."""
-LEAST_BRIGHTNESS = 1e-3  # least irradiance whose logarithm is taken, 1/m^2: a surface turned away
-PHASE_SIGMA_RAD = 0.35  # of a carrier's phase in a window, edges and texture included
+LEAST_BRIGHTNESS = 1e-3
+"""Least irradiance, in 1/m^2, whose logarithm is taken: a surface turned away has 0 or less."""
+PHASE_SIGMA_RAD = 0.35
+"""Standard deviation, in rad, of a carrier's phase in a window, edges and texture included. A
+larger one gives the evidence less weight beside neighbours."""
 MOST_AGREEMENT = 2.83**2 / 2
-"""Largest cost of a phase misfit: beyond it a window across an edge may show anything."""
+"""Largest cost of a phase misfit, that of 2.83 standard deviations: beyond it a window across an
+edge may show anything."""
 JUMP_RAD = 2.5
 """Jump of the residual or joint phase between neighbours from which on it costs no more: a depth
 edge costs this, whatever its height. Chosen, as the costs below, on train and validation
@@ -48,46 +54,72 @@ SHADING_COST = 0.003
 """Cost of a pixel, in rad of a jump, for each `SHADING_SPREAD` by which a candidate's log
 brightness is off."""
 SHADING_SPREAD = 0.1
-"""Unit of that misfit."""
+"""Misfit of the log brightness, natural, that costs `SHADING_COST`: about 10%."""
 SHADING_LIMIT = 3.0
-"""Units from which on a misfit costs no more."""
+"""Misfit in units of `SHADING_SPREAD` from which on it costs no more, so that one odd pixel does
+not outvote its neighbours."""
 PRIOR_COST = 0.002
-"""Cost of a pixel for each 100 mm from the standoff."""
+"""Cost of a pixel, in rad of a jump, for each 100 mm from the standoff; used with `--prior
+standoff` alone."""
 SMOOTHNESS = 33.0
 """Weight of the link between two pixels: a pixel's window shares most of its light with its
 neighbour's, and one pixel's light may be that of two surfaces."""
-LIGHT_SIGMA, LIGHT_NOISE, MOST_LIGHT = 0.06, 1.2, 6.5
-"""Of a pixel's light over its brightness: standard uncertainty of the model, what noise over
-brightness adds, and the largest cost."""
-INDIRECT_PERIODS, MOST_INDIRECT = 1.0, 0.4
-"""Light from other surfaces changes slowly: the window of its median, and its largest share of the
-brightness."""
+LIGHT_SIGMA = 0.06
+"""Standard uncertainty of the model of a pixel's light over its brightness, apart from noise.
+Chosen, as weights and limits of three crossed frames, on training and validation objects with thin
+parts (`docs/results/crossed.md`)."""
+LIGHT_NOISE = 1.2
+"""Factor on noise over brightness that is added to that uncertainty: the mean and the modulation of
+three frames both have noise."""
+MOST_LIGHT = 6.5
+"""Largest cost of a pixel's light, that of 3.6 standard deviations: beyond it the pixel shows
+something else."""
+INDIRECT_PERIODS = 1.0
+"""Side, in periods, of the window of the median that light from other surfaces is taken from: such
+light changes slowly."""
+MOST_INDIRECT = 0.4
+"""Largest share of the brightness that may be light from other surfaces. Above it the median more
+likely holds wrong candidates than such light."""
 MEDIAN_STEP = 0.005
-LEAST_BRIGHT = 1.0  # grey levels
+"""Step of the levels of which the median is taken, in shares of the brightness: 255 levels cover
++-0.635, beyond `MOST_INDIRECT`, and OpenCV's median of bytes is fast."""
+LEAST_BRIGHT = 1.0
+"""Least brightness, in grey levels, that light is divided by: it keeps the share finite in the
+dark."""
 EVIDENCE_WEIGHT = 2.0
 """One carrier's phase has no error: evidence tells twice as much of the order as in one frame."""
 STEEPEST_PERIODS = 1.2
-"""Largest change of the residual phase along a period of the image, in periods, within a smooth
-surface: a window that covers both sides of a depth edge turns the jump into a slope, mostly a
-larger one."""
-LARGEST_MISFIT, MISFIT_PERIODS = 0.4, 0.06
-"""Largest misfit of the fringe over its brightness within a surface, and the Gaussian, in periods,
-under which it is averaged: a depth edge is a line along which the window's fringe is not seen,
-whatever the phases of both sides."""
+"""Largest change of the residual phase along a period of the image, in periods, on a smooth
+surface: at a depth edge it is mostly larger, since a window turns the jump into a slope. Chosen, as
+those to `LIKELY`, on an image of a real skull (`docs/results/phase_route.md`)."""
+LARGEST_MISFIT = 0.4
+"""Largest misfit of the fringe over its brightness within a surface. A depth edge is a line along
+which the window's fringe is not seen, whatever the phases of both sides."""
+MISFIT_PERIODS = 0.06
+"""Sigma, in periods, of the Gaussian under which that misfit is averaged: narrow, because the line
+is."""
 NECK_PERIODS = 0.25
 """Half the width of the narrowest connection between parts of a surface. Along a depth edge the
 jump is a whole number of periods here and there, and looks continuous; such places are short."""
-LEAST_AREA_PERIODS = 0.5  # smallest surface, in squares of one period
-OUT_SHARE, OUT_AREA_PERIODS = 0.05, 0.1
-"""Share of a surface, and its area in squares of one period, that must leave the range for an order
-to be ruled out."""
+LEAST_SETTLED_AREA_PERIODS = 0.5
+"""Area, in squares of one period, of the smallest surface whose order the range may settle. A
+smaller surface stays ambiguous, or continues a settled one."""
+OUT_SHARE = 0.05
+"""Least share of a surface that must leave the range for an order to be ruled out; its own order
+must leave less of it beyond. A smaller share lets stray pixels decide."""
+OUT_AREA_PERIODS = 0.1
+"""Least area of the part that leaves the range, in squares of one period: on a small surface the
+share alone would be a few pixels."""
 REACH_PERIODS = 0.35
+"""Distance from a settled surface, in periods, within which a pixel continues it."""
 CONTINUES_RAD = 0.8
-"""Distance from a settled surface, and difference of the residual phase, within which a pixel
-continues it."""
-SURE, LIKELY = 1.0, 0.03
-"""Margins of an order that is settled, and of one that may well be wrong, so that its stated
-uncertainty is a good part of an order: at the edge of a surface the phase may be that of two."""
+"""Difference of the residual phase, in rad, from that surface within which such a pixel continues
+it: far less than the 2 pi of another order."""
+SURE = 1.0
+"""Margin of an order that range and continuity settle, 1: that which rules the rival out."""
+LIKELY = 0.03
+"""Margin of an order that may well be wrong, as at the edge of a surface, where the phase may be
+that of two. Its stated uncertainty is then a good part of an order."""
 
 
 class Term(NamedTuple):
@@ -346,7 +378,7 @@ def margin_by_range(seen: Observation, order: NDArray[np.int32]) -> Image:
     cores = cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, neck)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(cores, connectivity=4)
     areas = stats[:, cv2.CC_STAT_AREA]
-    settled = areas >= LEAST_AREA_PERIODS * square
+    settled = areas >= LEAST_SETTLED_AREA_PERIODS * square
     settled[0] = False
     for rival in (
         -1,

@@ -13,7 +13,9 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 from fpp_ml_bench.options import option
 
 Prior = Literal["none", "standoff"]
-PIXELWISE = 3  # frames from which on every pixel has a phase of its own
+PIXELWISE = 3
+"""Frames from which on every pixel has a phase of its own: three equations for phase, modulation
+and mean."""
 PAIR_DEGREES = 120.0
 """Phase shift between two frames: that of the first two of three, so that a third frame completes
 them."""

@@ -54,6 +54,8 @@ CACHE = (
     Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "fpp-ml-bench" / "robustness"
 )
 LIMIT_BYTES = 10_000_000_000
+"""Most bytes that the cache of rendered frames takes on disk; the folders that were used longest
+ago go first."""
 Frames = list[NDArray[np.uint8] | None]
 Share = Annotated[float, Field(gt=0, le=1)]
 Above0 = Annotated[float, Field(gt=0)]

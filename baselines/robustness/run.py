@@ -33,6 +33,7 @@ from fpp_ml_bench.pool import mapping
 from fpp_ml_bench.style import LINE, LINE_COLOURS, data_uri, page, panels, styled, with_legend
 
 QUICK_SEVERITIES = (1, 3, 5)
+"""Severities of a quick run: both ends and the middle show a curve's course."""
 SEVERITIES = (1, 2, 3, 4, 5)
 PAGE, CURVES = "index.html", "curves.png"
 _DASHES = ("-", "--", ":")

@@ -30,8 +30,10 @@ Expects = Literal["number", "refusal", "either"]
 Run = Callable[..., "Outcome"]
 Floats = NDArray[np.float64]
 
-U64, U32 = 2.0**-53, 2.0**-24
-"""Unit round-offs."""
+U64 = 2.0**-53
+"""Unit round-off of float64."""
+U32 = 2.0**-24
+"""Unit round-off of float32."""
 GROUPS = {
     "phase": "frames",
     "order": "frames",

@@ -35,8 +35,15 @@ from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES, Direction, Sequence
 
-MEAN, MODULATION, PLANE_M = 127.5, 100.0, 1.8
+MEAN = 127.5
+"""Mean grey level of the cases' fringes: the middle of 0 to 255."""
+MODULATION = 100.0
+"""Modulation of the cases' fringes, in grey levels: a bright fringe that is not clipped."""
+PLANE_M = 1.8
+"""Distance of the cases' plane in m: the paper's standoff."""
 MODULATIONS = (100.0, 30.0, 10.0, 5.0, 1.0, 0.1)
+"""Modulations in grey levels: from a bright fringe, across the decoder's limit of 5, to less than a
+grey level."""
 
 
 def phases(count: int = 720) -> Floats:
@@ -429,7 +436,12 @@ def flipped_bit(bit: int, direction: Direction) -> Outcome:
 
 CROSSED_RIG = replace(crossed_rig(320, "crossed-18"), background_m=None)
 CARRIERS: Crossed = CROSSED_RIG.crossed  # type: ignore[assignment]
-DEPTH_M, AMBIENT, NOISE = 1.78, 6.0, 0.7
+DEPTH_M = 1.78
+"""Distance of the plane that crossed fringes light, in m: near the standoff of 1.8 m, not at it."""
+AMBIENT = 6.0
+"""Ambient light of these frames, in grey levels."""
+NOISE = 0.7
+"""Standard deviation of their noise, in grey levels."""
 MIDDLE = slice(120, 200), slice(120, 200)
 """Pixels that are judged: no window of theirs leaves the mask."""
 

@@ -23,6 +23,7 @@ from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function
 from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
 
 ALPHA = 0.7
+"""Share of the object in the hybrid loss: the default of `training.losses`."""
 SMALL = {
     "unet": {"width": 4},
     "transunet": {"width": 16, "map_size": 4, "patch": 2},

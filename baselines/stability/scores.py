@@ -35,7 +35,11 @@ RANDOM = 6.0
 for one case in a hundred million (Higham and Mary 2019). Where the numbers are all alike the worst
 case n u is used."""
 _TINY = 2.0**-149
-_STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
+"""Smallest number of float32 above 0."""
+_STREAM_BLOCK = 1_000_000
+"""Pixels in a block of the streamed case."""
+_STREAM_KINDS = 20
+"""Kinds of blocks in the streamed case; each is summed once."""
 
 
 def depth_map(low_mm: float, span_mm: float, stored: str) -> NDArray:

@@ -42,6 +42,8 @@ DICTIONARIES = (
 """Those that hold all markers which boards are printed with: the smaller ones are their
 beginnings."""
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
+"""Where OpenCV's search for a corner stops: after 100 steps, or at a step below 1e-5 px, far below
+the error of a corner."""
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,18 @@ BOARD_SHARE = 0.01
 are estimated. It also fixes what the images can't: the estimated points fit the nominal ones best
 in position, turn and scale."""
 LEAST_SIGMA_PX = 1e-6
+"""Least extra standard deviation of points, in px, beside the known one: exact points would be
+divided by 0."""
 TOLERANCE = 1e-11
+"""Relative change of cost, unknowns and gradient at which the fit ends: far below what noise does
+to them, and above float64's rounding."""
 
 OUTLINE_POINTS = 180
+"""Points of a circle's outline, every 2 degrees, whose image tells where the image's centroid
+lies."""
 SWEEPS = 5
+"""Passes over the poses of a board whose points could be numbered in several ways. In each, a pose
+takes the numbering that agrees best with the others."""
 
 
 class Bundle:

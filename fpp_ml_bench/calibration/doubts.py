@@ -30,10 +30,11 @@ of the baseline."""
 LARGEST_RMS_PX = 1.0
 """Of camera pixels, and of projector pixels where they are no finer: good calibrations stay below
 0.5."""
-SQUARE, ASPECTS = 0.005, (1.0, 0.5, 2.0)
-"""How far fx / fy may be off square pixels, or those of 2 : 1 that some panels have, relatively.
-Sensors and panels are made to 0.0001; an irregular board, which the stated uncertainties do not
-contain, adds 0.0004 on real poses."""
+SQUARE = 0.005
+"""How far fx / fy may be off a usual ratio, relatively. Sensors and panels are made to 0.0001; an
+irregular board, which the stated uncertainties do not contain, adds 0.0004 on real poses."""
+ASPECTS = (1.0, 0.5, 2.0)
+"""Usual ratios: square pixels, and those of 2 : 1 that some panels have, either way round."""
 FOCALS = (0.25, 30.0)
 """Focal length in longer sides of the image: a field of view of 127 degrees, or of 2."""
 LARGEST_OFFSETS = (0.2, 1.0)
@@ -44,9 +45,13 @@ LARGEST_DISTORTIONS = (0.4, 0.15)
 """Of camera and projector: shift by the lens, as a share of the distance from its axis, at the
 board's outer points. A wide lens has 0.3, projectors have 0.02."""
 SIGMAS = 4.0
-BASELINES_MM, BOARDS_MM = (30.0, 10_000.0), (15.0, 1500.0)
-"""The housings of a camera and a projector are farther apart, and printers and plates are not as
-large."""
+"""Standard uncertainties by which a figure must also exceed its limit, so that noise makes no
+doubt."""
+BASELINES_MM = (30.0, 10_000.0)
+"""Least and largest baseline, in mm: the housings of a camera and a projector are farther apart
+than the least."""
+BOARDS_MM = (15.0, 1500.0)
+"""Least and largest longer side of a board, in mm: printers and plates are not larger."""
 
 
 SPACING = (

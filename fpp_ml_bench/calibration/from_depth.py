@@ -41,21 +41,41 @@ from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 from fpp_ml_bench.optics.sequence import AXES
 
 LEAST_PX = 200
+"""Fewest pixels with depth and both phases that a projector is fitted to: many times its twelve or
+so unknowns."""
 MOST_SIGMA_PX = 1.5
 """Robust standard deviation above which the frames are not those of the depth: the decoder's limit
 for a pixel."""
 MOST_RELATIVE_ERROR = 0.02
 """Of the pitch and the focal length: above it, the views don't determine them."""
 MOST_OFF_SQUARE = 0.01
+"""How far the projector's aspect may be from 1, beyond its uncertainty, before the calibration is
+refused."""
 _SIGMAS = 3.0
-_PITCH_SHARE, _PITCH_PX = 0.005, 0.25
-"""A pitch this near to a whole one may be it, whatever its standard error: the part that noise does
-not explain."""
+"""Standard errors within which a measured number may be a rounder one: three hold 99.7% of
+chance."""
+_PITCH_SHARE = 0.005
+"""A pitch this near to a whole one, as a share, may be it, whatever its standard error: the part
+that noise does not explain."""
+_PITCH_PX = 0.25
+"""Largest such distance in px: at 0.25, half of all pitches would be near to a whole one."""
 _MOST_APART_PX = 0.5
-_MOST_WORSE, _WORSE_PX = 1.05, 1e-3
+"""Uncertainty of a pitch, in px, from which on no whole one is taken: half of their distance, so
+that any pitch would be near to one."""
+_MOST_WORSE = 1.05
+"""Factor by which a fit with a rounder pitch may be worse than that without, where the pitch is not
+certain."""
+_WORSE_PX = 1e-3
+"""Also allowed in px, so that fits of exact depth, whose residuals are almost 0, may round too."""
 _SMALLEST_PX = 1e-4
+"""Added to a pitch's uncertainty in px: what rounding leaves where depth has no noise."""
 _LEVELS = 99.9, 0.1
-_STEP_MM, _BEHIND_M = 10, 0.1
+"""Percentiles of the depths between which the range is set, so that a stray pixel does not widen
+it."""
+_STEP_MM = 10
+"""The ends of the range are whole multiples of this, at least one step beyond the depths."""
+_BEHIND_M = 0.1
+"""Least distance of the background plane behind the range, in m."""
 
 Pair = tuple[float, float]
 

@@ -32,6 +32,8 @@ from fpp_ml_bench.optics.sequence import AXES, Direction
 MOST_PX = 50_000
 """Pixels that a fit uses, of all views together."""
 _CODED_PX = 65536
+"""Side, in px, of the imagined projector in which the code is decoded before its own size is known:
+a power of 2, so that cells are whole."""
 LEAST_THICKNESS = 0.01
 """Of the surface across its mean plane, as a part of its extent along it (RMS): below, the surface
 is taken as flat."""
@@ -39,12 +41,19 @@ LEAST_GAP = 5.0
 """Between the two smallest singular values of the linear system: less, and the solution is not the
 only one."""
 LEAST_SINGULAR = 1e-5
+"""Least ratio of the second smallest singular value of the linear system to the largest one: below,
+the points do not tell the projection."""
 MOST_SKEW = 0.05
 """Of K, as a part of the focal length: a projector's axes are square to each other to far better
 than 3 degrees."""
 _MOST_TRIMMINGS = 30
+"""Most rounds in which outliers of the linear fit are left out; rounds end before where none
+changes."""
 _KEPT_MEDIANS = 5.0
+"""Distance, in medians of all distances, up to which a pixel takes part in the next round: wrong
+orders lie far beyond."""
 _SMALLEST_PERIODS = 1e-9
+"""Added to that limit, in periods, so that exact pixels, whose median is 0, all stay."""
 POSE = frozenset({"turn_x", "turn_y", "turn_z", "t_x", "t_y", "t_z"})
 CENTRE, PITCH = frozenset({"c_u", "c_v"}), frozenset({"pitch_u", "pitch_v"})
 NAMES = (
@@ -68,8 +77,12 @@ MOST_CONDITION = 1e7
 """Of the Jacobian with its columns scaled to equal length; the benchmark's objects give some
 thousands."""
 _SMALLEST_PX = 1e-3
+"""Least knee of the robust loss, in px: exact pixels would have a knee of 0."""
 _BANDS = 16
+"""Bands of pixels in each view that are taken as independent where uncertainties are estimated:
+errors of neighbouring pixels go together."""
 _MOST_EVALUATIONS = 100
+"""Most evaluations of the fit, so that data that no projector explains end it."""
 
 
 class DepthView(NamedTuple):

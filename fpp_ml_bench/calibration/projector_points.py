@@ -29,8 +29,14 @@ from fpp_ml_bench.optics.sequence import AXES
 
 WINDOW_SHARE = 0.5
 """Radius of the window, in distances to the nearest neighbour."""
-LEAST_RADIUS_PX, LARGEST_RADIUS_PX = 4.0, 24.0
+LEAST_RADIUS_PX = 4.0
+"""Least radius of the window in px: a disc of 4 px has 49 pixels, twice `FEWEST_PIXELS`."""
+LARGEST_RADIUS_PX = 24.0
+"""Largest radius of the window in px: a larger one sees more of the lens's distortion, which a
+homography does not describe."""
 FEWEST_PIXELS = 24
+"""Decoded pixels that a point needs: a homography has eight unknowns, and each pixel gives two
+equations with noise."""
 LEAST_SPREAD = 0.15
 """Smallest standard deviation of the pixels' positions along any direction, in window radii: 0.5
 for a full disc."""
@@ -40,10 +46,14 @@ TUKEY = 6.0
 """Residuals beyond this many robust sigmas get no weight."""
 
 GAMMAS = (0.3, 4.0)
+"""Least and largest gamma of a projector that is looked for; a projector's is mostly between 1 and
+2.5."""
 LEAST_LEVELS = 4
 """Frames of a pixel: two of its own unknowns, and the response."""
 LEAST_RESPONSE_PIXELS = 200
+"""Fewest bright pixels from which the response is measured; with fewer it is not."""
 MOST_RESPONSE_PIXELS = 4000
+"""Pixels of a pose, about, from which it is measured: enough for a smooth curve, and quick."""
 AVERAGED_PERIODS = 1.5
 """Width of the average in periods of the finest fringes."""
 BRIGHT_SHARE = 0.5

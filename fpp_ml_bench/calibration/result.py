@@ -35,12 +35,17 @@ _FIXED = {
     2: cv2.CALIB_ZERO_TANGENT_DIST,
     4: cv2.CALIB_FIX_K3,
 }
-SPOILER_SIGMAS, SPOILER_SHARE = 3.5, 1.2
-"""A pose is named when its held-out error lies above the median by this many robust sigmas and by
-half of the median, and its error in the fit is this many times the median: one that is only unlike
-the others predicts badly, but fits."""
-ACROSS, DEPTHS = 24, 9
-"""Points across the image, along each side, and along the range."""
+SPOILER_SIGMAS = 3.5
+"""Robust standard deviations above the median, and at least half of the median, from which on a
+pose's held-out error is high."""
+SPOILER_SHARE = 1.2
+"""Such a pose is named where its error in the fit is this many times the median, too: one that is
+only unlike the others predicts badly, but fits."""
+ACROSS = 24
+"""Points along each side of the image at which two rigs are compared: enough for a mean of smooth
+differences."""
+DEPTHS = 9
+"""Depths along the range at which they are compared."""
 
 
 @dataclass(frozen=True)

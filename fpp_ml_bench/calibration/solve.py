@@ -20,16 +20,25 @@ from fpp_ml_bench.errors import CalibrationError, CaptureError
 from fpp_ml_bench.optics.pinhole import Pinhole
 
 FEWEST_POSES = 3
+"""Poses of a flat board that are needed: two give four equations for focal lengths and centre,
+which leaves nothing to judge the fit by."""
 FEWEST_POINTS = 6
+"""Points of a pose with projector coordinates that are needed: its homography needs four, and more
+show errors."""
 LEAST_TILT_RAD = np.deg2rad(5.0)
+"""Least angle between the boards of two poses, in rad. Parallel boards do not tell the focal
+length."""
 LARGEST_FOCAL_SIGMA = 0.05
 """Relative standard uncertainty of a focal length."""
 MARGIN = 0.1
 """By which projector coordinates may lie outside the projector, in its sizes: the fringes end
 there."""
 WEIGHT_ROUNDS = 4
+"""Most fits that are repeated with the variances that the last one showed."""
 CIRCLE_ROUNDS = 10
+"""Most fits that are repeated with circles' centroids moved to their centres."""
 CIRCLE_TOLERANCE_PX = 1e-7
+"""Largest change of these centres, in px, at which the rounds end: far below any measured error."""
 
 
 def check_poses(

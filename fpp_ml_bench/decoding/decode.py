@@ -38,15 +38,22 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 from fpp_ml_bench.skipping import skipping_enabled
 
 SAMPLED_PX = 4096
+"""Pixels, at most, on which the frames are tested: enough for means of many periods, and a small
+part of the decoding time."""
 LEAST_PX = 64
 """With fewer pixels the mean depends more on the scene than on the frame."""
 LEAST_OFF_GREY = 16.0
+"""Deviation of a frame's mean in grey levels, from the one that the others predict, below which no
+frame is wrong: on dark captures a share alone would be a few levels."""
 LEAST_OFF_SHARE = 0.3
-"""A frame is wrong when its mean deviates by more than both limits: no lamp flickers by 30%."""
+"""The same limit as a share: a frame is wrong when its mean deviates by more than both, since no
+lamp flickers by 30%."""
 AGREEMENT_GREY = 3.0
 """Largest residual of the other frames' means. Above it, the scene does not follow the model (a
 strong gamma on a few pixels), and no frame is reported."""
 LEAST_STEPS_FOR_MEANS = 7
+"""Steps from which on means are tested. With fewer, too few other frames tell which one is wrong,
+and only a black frame is looked for."""
 OPPOSITE_SPAN_GREY = 40
 """A correct frame is black only where all phases are within 0.2 rad of its minimum; the frame half
 a period later then spans at most a fifth of the modulation."""

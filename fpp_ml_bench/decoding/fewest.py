@@ -30,6 +30,8 @@ _GRID = 33
 """Rays per image side that represent the image: projections are smooth, and the outermost rays are
 included."""
 CODE_MARGIN_CELLS = 1
+"""Gray cells that are added on both sides of what is in view, since noise may move a pixel into the
+next one."""
 LEAST_TOLERANCE_PX = 1.0
 """Distance in projector px that noise may move a pixel off its epipolar line. The decoder's worst
 case (3 steps, least modulation) has a sigma of 0.5 px, usual pixels have 0.02 px."""

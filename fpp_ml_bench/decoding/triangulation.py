@@ -30,15 +30,30 @@ if TYPE_CHECKING:
     from fpp_ml_bench.decoding.decode import Decoded
 
 FIXED_POINT_STEPS = 50
+"""Most steps of the iteration that removes the projector's distortion. A coordinate that is not
+steady after them gets no depth."""
 FIXED_POINT_TOLERANCE = 1e-13
 """Largest last change, in normalised units, of a projector coordinate after its distortion was
 removed by iteration."""
 ASSUMED_NOISE_GREY = 1.0
 """Where the frames don't tell: three steps fit any three grey levels."""
-_SAMPLED_PX, _LEAST_PX = 50_000, 100
-_BRIGHTNESSES = 12  # groups of as many pixels each
-_LEAST_VARIANCE = 1 / 12  # of rounding to whole grey levels
-_HIGHEST_HARMONIC, _LEAST_HARMONIC = 4, 0.01
+_SAMPLED_PX = 50_000
+"""Pixels of a frame, about, from which its noise is estimated: thousands for each group of
+brightness, at a small part of the time."""
+_LEAST_PX = 100
+"""Fewest pixels of a direction that are lit and not clipped from which its noise is estimated; with
+fewer the direction is left out."""
+_BRIGHTNESSES = 12
+"""Groups of as many pixels each, by brightness, in which noise is estimated: noise grows with
+light, and the line through them needs several."""
+_LEAST_VARIANCE = 1 / 12
+"""Least variance of noise in squared grey levels: that of rounding to whole grey levels."""
+_HIGHEST_HARMONIC = 4
+"""Highest harmonic of a fringe that is taken for the response of projector or camera (gamma):
+higher ones are weak, and each takes freedom from the noise."""
+_LEAST_HARMONIC = 0.01
+"""Least share of the modulation that such a harmonic must have; below it the light counts as
+straight, and nothing is removed."""
 _MEDIAN_OF_SQUARE = (0.4549, 0.6931, 0.7887, 0.8392, 0.8703, 0.8914)
 """Median of chi^2 / n for 1 to 6 degrees of freedom; (1 - 2 / (9 n))^3 for more."""
 SYSTEMATIC_RAD = 0.005

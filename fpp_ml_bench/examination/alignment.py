@@ -42,7 +42,20 @@ ALIKE = 1.2
 """A cause explains as well as another one where it leaves at most so many times as much."""
 LEAST_REST_PX = 0.05
 """What rounding and interpolation leave; below it causes can't be compared."""
-_ROUNDS, _TUKEY, _STEP, _RANK, _NEIGHBOURS = 10, 4.685, 1e-6, 1e-3, 4
+_ROUNDS = 10
+"""Rounds of the robust fit of a cause, each with new weights and a step of Gauss and Newton."""
+_TUKEY = 4.685
+"""Residual, in robust standard deviations, from which on a point has no weight: the usual constant,
+with 95% of the efficiency of least squares under normal noise."""
+_STEP = 1e-6
+"""Step of the difference quotients of a cause's parameters: far below any change of interest, far
+above rounding."""
+_RANK = 1e-3
+"""Singular values below this share of the largest are left out of a fit: parameters that do the
+same would get large opposite values."""
+_NEIGHBOURS = 4
+"""Pixels that count as one where the size of a chance pattern is judged: those beside each other
+share their errors."""
 Part = Literal["shift", "turn", "roll", "zoom", "keystone", "barrel"]
 Device = Literal["camera", "projector", "pose"]
 Residual = Callable[[NDArray[np.float64]], NDArray[np.float64]]

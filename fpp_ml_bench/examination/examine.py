@@ -35,18 +35,25 @@ from fpp_ml_bench.examination.signals import (
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 
-OFFSET_TURNS, OFFSET_EDGES = 0.02, 100
+OFFSET_TURNS = 0.02
 """Smallest common offset of phase and Gray code that is a finding: 0.4 px of 18 px, which no light
-of ours makes by more than chance; and the edges that are needed to measure it."""
-RIPPLE_RAD, STEP_RAD = 0.02, 0.1
-"""Smallest ripple of twice the phase and smallest error of a shift that are findings: one of 8
-frames half late makes 0.05 and 0.37, one of 18 0.01 and 0.17; lamps that flicker by 2% make 0.012
-with three steps, and turn no shift."""
+of ours makes by more than chance."""
+OFFSET_EDGES = 100
+"""Edges between Gray cells that are needed to measure that offset. With fewer, chance makes it."""
+RIPPLE_RAD = 0.02
+"""Smallest ripple of twice the phase that is a finding, in rad. One of 8 frames half late makes
+0.05, one of 18 0.01; lamps that flicker by 2% make 0.012 with three steps."""
+STEP_RAD = 0.1
+"""Smallest error of a step's shift that is a finding, in rad. One of 8 frames half late makes 0.37,
+one of 18 0.17; lamps that flicker turn no shift."""
 RESPONSE_RAD = 0.006
 """Smallest ripple of N times the phase that is named: patterns of 8 bits make 0.003."""
-TRIED, IN_RANGE = 0.1, 0.05
-"""Other readings are tried where more of the lit pixels contradict the code, or twice as many
-neighbours each other, or fewer fit it, or almost none lies in the range."""
+TRIED = 0.1
+"""Other readings are tried where more than this share of the lit pixels contradict the code, where
+twice this share of neighbours contradict each other, or where fewer are coherent."""
+IN_RANGE = 0.05
+"""Share of the coherent pixels that must have a depth in the range; other readings are tried where
+fewer have."""
 MISALIGNED_SHARE = 0.0025
 """Of the projector's larger side: an epipolar pattern (RMS) from which the depth can't be trusted,
 3.2 px of 1280. The calibration that the authors of public captures used leaves 0.0017; depths by it
@@ -59,16 +66,29 @@ MOST_UNLIKE_STEPS = 6
 FEWEST_TURNS = 3.0
 """Turns from bright to dark along a line from which two bits can't be alike by chance: silhouettes
 make one or two."""
-TORN_SHARE, FEWEST_IN_BAND, MORE_IN_BAND = 0.8, 60, 0.4
-"""Largest share of the bands that are torn, where a tear and not the capture is at fault; the lit
-pixels that a band needs; and how much more of them contradict the code than in the best band:
-strong noise alone makes 0.2."""
-CONTRADICTING, DOUBTFUL = 0.6, 0.5
-"""Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
-MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
-"""Share of the lit pixels at which mean images differ, averaged over so many neighbours, where the
-scene moved."""
-_FINEST, _SCORED_PX = 2.0, 4000
+TORN_SHARE = 0.8
+"""Largest share of the bands that are torn where a tear, and not the whole capture, is at fault."""
+FEWEST_IN_BAND = 60
+"""Lit pixels that a band needs to be judged: with fewer, noise makes any share."""
+MORE_IN_BAND = 0.4
+"""How much more of a torn band's lit pixels contradict the code than of the best band's: strong
+noise alone makes 0.2."""
+CONTRADICTING = 0.6
+"""Share of the lit pixels that contradict the code above which depth is not to be trusted: the
+capture is refused."""
+DOUBTFUL = 0.5
+"""Share of the lit pixels that contradict the code above which depth is doubtful: a warning."""
+MOVED_SHARE = 0.05
+"""Share of the lit pixels at which mean images must differ for the scene to have moved. A smaller
+one takes reflections and noise for motion."""
+NEIGHBOURS_PX = 9
+"""Pixels along a line over which that difference is averaged: they share no noise."""
+_FINEST = 2.0
+"""Fringes of a pitch up to so many times the finest are tested for ripples: coarser ones do not act
+on the coordinate (`coding.phase_shift.FINE_RATIO`)."""
+_SCORED_PX = 4000
+"""Pixels of the lines, about, on which the reading that was given is judged: enough for shares of a
+percent."""
 CAPTURE_IN_TIME = (
     "capture again: trigger the camera by the projector, or wait longer after each pattern"
 )

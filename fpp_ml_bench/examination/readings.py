@@ -33,12 +33,27 @@ CLEARLY_LIT_GREY = 30.0
 LARGEST_DISAGREEMENT_PX = 8.0
 """Distance across the epipolar line from which a pixel contradicts: less is a calibration's
 error."""
-GOOD, FEWER = 0.8, 3.0
-"""A reading is named that fits so well, and leaves so many times fewer pixels that contradict it
-than the one given."""
-_FIRST_PX, _SECOND_PX, _FEWEST_PAIRS, _KEPT = 600, 4000, 40, 8
+GOOD = 0.8
+"""Share of fitting pixels from which on another reading may be named."""
+FEWER = 3.0
+"""How many times fewer pixels such a reading must leave that contradict it than the one given."""
+_FIRST_PX = 600
+"""Pixels, about, on which all readings are tried: few, since there are many readings."""
+_SECOND_PX = 4000
+"""Pixels, about, on which the best of these are judged, as the one given is
+(`examine._SCORED_PX`)."""
+_FEWEST_PAIRS = 40
+"""Pairs of neighbours that are needed to judge how orders or depths go on along a line; with fewer
+the measure is left out."""
+_KEPT = 8
+"""Best readings of the first round that are tried on more pixels. With fewer, noise in the first
+round could lose the right one."""
 _BACKGROUND_SHARE = 0.03
+"""Distance from the rig's background plane, as a share of its own, within which a depth counts as
+inside the range."""
 _WIDE_MM = (1e-6, 1e12)
+"""Nearest and farthest depth, in mm, that a reading may give before its range is judged: any at
+all."""
 
 
 Change = Callable[[Lines, Rig], tuple[Lines, Rig]]

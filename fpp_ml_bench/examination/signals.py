@@ -24,19 +24,39 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 
-LINES, MOST_PX = 40, 150_000
+LINES = 40
+"""Most lines, rows and columns of each, that are looked at: they cross everything that a capture
+shows, at a small part of the time."""
+MOST_PX = 150_000
+"""Most pixels on these lines; of large images fewer lines are taken."""
 LEAST_LIT_GREY = 3 * MIN_MODULATION
 """A pixel is lit where its grey levels differ by so much from frame to frame."""
 _LOOKED_AT_PX = 40_000
+"""Pixels of the coarse image, about, in which the lit part is found before lines are laid through
+it."""
 LEAST_PX = 200
+"""Fewest pixels from which frames are compared or phases are measured. With fewer, chance
+decides."""
 WINDOW_PERIODS = 2.5
 """Length of the windows in which a surface is taken for a cubic; a period must be seen by 4 px and
 more."""
-SHORTEST_PERIOD_PX, LONGEST_WINDOW_PX, FEWEST_WINDOWS = 4.0, 400, 30
-WHITE_RATIO, EQUAL_SHARE, GAIN = 1.8, 0.35, 0.1
-"""Two frames are equal where their difference is white (its mean square below so many times that of
-noise), below a share of what their steps would make, and their gain within this of 1."""
+SHORTEST_PERIOD_PX = 4.0
+"""Shortest period in the image, in px, of which ripples are measured: below it, a pixel averages
+the fringe away."""
+LONGEST_WINDOW_PX = 400
+"""Longest window, in px, in which a surface is taken for a cubic. In longer ones few surfaces
+are."""
+FEWEST_WINDOWS = 30
+"""Fewest windows from which ripples are measured: their mean must stand out of chance."""
+WHITE_RATIO = 1.8
+"""Two frames are equal where the mean square of their difference is below so many times that of its
+noise: then it is white."""
+EQUAL_SHARE = 0.35
+"""And where it is below this share of what the steps of the frames would make."""
+GAIN = 0.1
+"""And where the gain between the frames is within this of 1."""
 _EQUAL_PX = 30_000
+"""Pixels, about, that are compared, evenly spread: enough for the figures and quick."""
 SYMMETRIC = 0.3
 """Largest share of the cosine in a ripple that a response can make: a response alone makes none."""
 SIGMAS = 6.0
@@ -47,9 +67,11 @@ image at most."""
 ONE_PHASE = 0.7
 """Mean resultant length of the phases in a band that fringes hardly cross: two steps may be equally
 bright there."""
-PILED_SHARE, PILE_DEPTH = 0.01, 0.03
-"""Levels are saturated where so many of them are the highest one exactly, more than in this part of
-the levels below it. A whole crest without noise has half as many there."""
+PILED_SHARE = 0.01
+"""Share of the levels that must be exactly the highest one for it to be taken for saturation."""
+PILE_DEPTH = 0.03
+"""Part of the span below the highest level in which at least half of the levels must be the highest
+one itself. In a whole crest, fewer are."""
 CLEAR_LEVELS = 0.15
 """Distance from the middle grey level, in spans, from which a pixel is bright or dark: Gray frames
 have 0.5, sinusoids 0.35 in the median, and blurred fringes less."""

@@ -26,10 +26,16 @@ from fpp_ml_bench.optics.rig import Rig
 SMALLEST = 2e-4
 """A bounce that adds less everywhere, a twentieth of a grey level, is the last."""
 MOST_BOUNCES = 64
-PLANE_CELLS, PLANE_POINTS = 24, 6
-"""Cells along the longer side of the plane's lit part, and points across a cell."""
+"""Most bounces that are followed: light falls by the albedo at each, so `SMALLEST` ends them
+before."""
+PLANE_CELLS = 24
+"""Cells along the longer side of the plane's lit part: its light changes slowly."""
+PLANE_POINTS = 6
+"""Points across a cell at which its mean light is taken: several, so that fringes average out."""
 _TOGETHER = 64
+"""Points whose sums are kept until they are written at once, so that they stay in the cache."""
 _MOST = 27 * SIDES * SLABS
+"""Most surfels near a point: those of 3 x 3 x 3 cells, each with `SIDES` x `SLABS`."""
 
 
 class PlaneLight(NamedTuple):

@@ -23,7 +23,9 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Of red, green and blue of BT.709, which are those of sRGB."""
 MOST_TEXTURE_PX = 1 << 26
 """Of one image; all that a mesh names have at most twice as many."""
-_ROWS_AT_ONCE = 256  # of an image whose luminance is computed: eight bytes a channel and pixel
+_ROWS_AT_ONCE = 256
+"""Rows of an image whose luminance is computed at once: it takes eight bytes a channel and
+pixel."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ APART_MM = 2.0
 """Rays of a pixel see different surfaces where a depth is this far from the plane that the central
 ray sees."""
 _EDGE_COSINE = 0.9
+"""Least cosine between normals on one side of an edge: 26 degrees; more is a crease."""
 
 
 @dataclass(frozen=True)

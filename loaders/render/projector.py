@@ -52,6 +52,8 @@ HARMONICS = 16
 """The highest m and n of a response that is no line; a projector gamma of 2.2 leaves 2e-6 of the
 light beyond."""
 _LEAST = 1e-9
+"""Least share of a term of the light's cosine series that is summed: smaller ones add no light that
+a sensor tells."""
 
 
 class PatternPlace(NamedTuple):

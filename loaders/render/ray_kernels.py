@@ -18,6 +18,8 @@ NARROWED_FROM_PX = 8
 """From this width on the columns of a row that a triangle can cover are computed, and not just
 tried."""
 _NEAR_M = 1e-6
+"""Distance in front of the camera, in m, below which a triangle's image has no bounds, and all rays
+are tried."""
 
 
 @njit

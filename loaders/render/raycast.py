@@ -19,6 +19,8 @@ from fpp_ml_bench.optics.pinhole import Pinhole
 LEAF = 4
 """Most triangles in a leaf of the box tree."""
 _SHADOW_OFFSET_M = 1e-4
+"""Distance in m by which a ray to the light starts off its surface, so that it does not meet that
+surface itself by rounding."""
 
 
 @dataclass(frozen=True)

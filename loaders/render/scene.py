@@ -47,6 +47,8 @@ PHOTOGRAPHED_BY = "photographed_by"
 SAME_VOLUME = 0.02
 """Difference of a rig's volume from that of the paper's, which a calibration of it may have."""
 _MARGIN_PX = 2.0
+"""Distance in px that an object keeps from the sides of the image, so that its whole outline is
+seen."""
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,18 @@ RAYS = 64
 """From each surfel. A point's light comes from several surfels, so their noise is small
 (docs/light.md)."""
 _PLASTIC_SQUARED = 0.5698402909980532
+"""Square of `PLASTIC`: the second of two steps that spread points evenly over a square."""
 _OFFSET_M = 1e-5
+"""Distance in m by which a ray starts off its surfel, so that it does not meet its own surface by
+rounding."""
 OFF_PLANE = 15.0
 """Distance along the normal counts four times: a surfel on another step is not beside the point."""
-SIDES, SLABS = 6, 4
+SIDES = 6
+"""Directions that a surfel of a cell may face: along and against each axis. Surfaces back to back
+do not share one."""
+SLABS = 4
+"""Layers of a cell across the side that its surfels face, so that close steps of a surface do not
+share one."""
 
 
 class SurfacePoints(NamedTuple):

@@ -25,12 +25,20 @@ MARGIN = {"checker": 1.5, "circles": 0.75, "circles-asymmetric": 0.75, "charuco"
 """From the outer points to the end of the sheet, in spacings."""
 COVERED = 0.65
 """Share of the image at the standoff that the longer side of `fitting_board` takes."""
-MOST_TILT, LEAST_TILT = 30 / 360, 0.4
-"""Largest tilt of a pose in turns, and the least as its share."""
+MOST_TILT = 30 / 360
+"""Largest tilt of a pose, in turns: 30 degrees."""
+LEAST_TILT = 0.4
+"""Least tilt of a pose, as a share of the largest: poses that face the camera do not tell the focal
+length."""
 NICE = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+"""Spacings of a board in powers of ten of mm: round numbers that are easy to measure."""
 _STEPS = 20
+"""Steps in which a place in the image, and a distance in the range, is tried: one in twenty is near
+enough to the farthest one."""
 _MARGIN_PX = 2.0
+"""Distance in px that the sheet keeps from the sides of image and pattern."""
 _PLACES = ((0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, 0), (1, 0))
+"""Places of the board, right and down from the middle: the middle, the corners, then the sides."""
 
 
 @dataclass(frozen=True)

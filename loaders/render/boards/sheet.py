@@ -25,6 +25,8 @@ DARK = 0.25
 """Albedo of the print, over that of the sheet. Fringes on it keep a modulation above the decoder's
 limit of 5 grey levels in the named light `paper`, so circles are decoded inside too."""
 EDGE_RAYS = 4
+"""Rays along each side of a pixel that sees an edge of the print: with four, a circle's centroid is
+right to a thousandth of a pixel."""
 Values = NDArray[np.float64]
 Footprint = tuple[Values, ...]
 """How x and y on the board, mm, change over the width of a ray's part of the image, and then over
