@@ -193,5 +193,5 @@ def test_a_pair_with_a_rival_too_near_is_not_proposed() -> None:
     found = search(deep, Assumptions(), (8.0, 10.0, 12.0))
     assert [candidate.rival_rad < 0.15 for candidate in found.searched] == [True, True, False]
     assert found.proposed is found.searched[2]
-    with pytest.raises(RigError, match="each of 2 periods has a wrong order within 0.13 rad"):
+    with pytest.raises(RigError, match=r"each of 2 periods has a wrong order within 0\.13 rad"):
         search(deep, Assumptions(), (8.0, 10.0))
