@@ -189,9 +189,9 @@ def _render(work: tuple[Path, int], setting: Setting) -> None:
     images = list(_images(setting, unions if setting.split == "train" else 0))
     for number, image in enumerate(images):
         content |= {f"{number}-{e.name}": getattr(image, e.name) for e in fields(FringeImage)}
-    file = BytesIO()
-    np.savez_compressed(file, count=len(images), **content)
-    write_atomically(_file(folder, setting), file.getvalue(), sync=False)
+    buffer = BytesIO()
+    np.savez_compressed(buffer, count=len(images), **content)
+    write_atomically(_file(folder, setting), buffer.getvalue(), sync=False)
 
 
 def _images(setting: Setting, unions: int) -> Iterator[FringeImage]:
