@@ -7,6 +7,7 @@ where the empty scene misfits most, which a mask must not take for an object. Th
 that the objects fit its volume as they are: phases do not depend on the unit of length.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from io import BytesIO
@@ -26,6 +27,7 @@ from fpp_ml_bench.baselines.learned.scenes import (
     photographed,
     with_unions,
 )
+from fpp_ml_bench.baselines.learned.warp import signs_of
 from fpp_ml_bench.baselines.phase.empty_scene import Background, CrossedEmptyScene, EmptyScene
 from fpp_ml_bench.baselines.phase.geometry import (
     CalibrationLayer,
@@ -224,7 +226,7 @@ def _images(setting: Setting, unions: int) -> Iterator[FringeImage]:
             yield from kinds[which].cut(seen, seen.frames[which], seen.frames[3], number)
 
 
-class _Kind:
+class _Kind(ABC):
     """One kind of fringes of a rig: ``fringes``, and their carriers."""
 
     fringes: Fringes
@@ -232,13 +234,13 @@ class _Kind:
     step_rad: NDArray[np.float64]
     signs: NDArray[np.float64]
 
+    @abstractmethod
     def background(self, grey: NDArray[np.uint8]) -> Background:
         """The empty scene fitted to a frame (H, W)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def phases(self, depth_mm: NDArray) -> NDArray:
         """Phases (K, H, W) of a depth."""
-        raise NotImplementedError
 
     def cut(
         self, view: View, frame: NDArray, bright: NDArray, number: int
@@ -299,7 +301,7 @@ class _Crossed(_Kind):
             raise TrainingError("expected a rig with crossed frames")
         self.carriers = carriers = Carriers.of(rig, rig.crossed)
         self.period_px, self.step_rad = carriers.period_px, carriers.step_rad
-        self.signs = np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in carriers.gain])
+        self.signs = signs_of(carriers)
         stride = stride_of(self.period_px)
         self._demodulator = Demodulator(carriers, stride)
         self._scene = CrossedEmptyScene(carriers, stride)

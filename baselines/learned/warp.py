@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase.geometry import Carriers, Image, wrapped
 from fpp_ml_bench.constants import TAU
-from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.named_rigs import CROSSED, DEFAULT_CROSSED, crossed_rig
 
 NEAR_SHARE = 0.02
 """Largest difference of the map from none at which the image stays as it is: within it a network
@@ -45,11 +45,8 @@ def known(carriers: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     the paper's rig."""
     if carriers == 1:
         return np.array([[0.0, TAU / KNOWN_PX[1]]]), np.ones(1)
-    rig = crossed_rig()
-    assert rig.crossed is not None
-    pair = Carriers.of(rig, rig.crossed)
-    signs = np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in pair.gain])
-    return pair.step_rad, signs
+    pair = Carriers.of(crossed_rig(), CROSSED[DEFAULT_CROSSED])
+    return pair.step_rad, signs_of(pair)
 
 
 def to_known(
@@ -87,7 +84,7 @@ class Warp:
     def of_pair(cls, carriers: Carriers, learned: Carriers) -> "Warp":
         """Of two carriers. A phase that grows with nearness does so in the network's image too:
         where a sign asks for it, the image is mirrored."""
-        signs = np.prod([_signs(one) for one in (carriers, learned)], axis=0)
+        signs = np.prod([signs_of(one) for one in (carriers, learned)], axis=0)
         matrix = np.linalg.solve(learned.step_rad, signs[:, None] * carriers.step_rad)
         return cls(matrix, learned.step_rad, signs)
 
@@ -161,6 +158,6 @@ class Warp:
         return (int(across), int(down)), -least
 
 
-def _signs(carriers: Carriers) -> NDArray[np.float64]:
-    """Whether each phase grows with nearness (1) or falls (-1)."""
+def signs_of(carriers: Carriers) -> NDArray[np.float64]:
+    """Whether each phase (K,) grows with nearness, 1, or falls, -1."""
     return np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in carriers.gain])
