@@ -38,8 +38,8 @@ from fpp_ml_bench.baselines.learned.warp import (
     KNOWN_PX,
     PERIOD_RATIO,
     PLACES,
-    SHARPEST_PX,
     known_scale,
+    smoothed,
     to_known,
 )
 from fpp_ml_bench.baselines.learned.windows import Window, mean_scores
@@ -56,8 +56,6 @@ SMALL = 0.05
 """Error of M and D below which its loss is quadratic, in the amplitude of the surroundings."""
 CLAMP = 4.0
 """Largest M and D that are learned, in that amplitude."""
-TWO_SIDED_RAD = 1.0
-"""With which a missed or an invented pixel counts in validation, as one of a wrong order does."""
 
 
 @dataclass(frozen=True)
@@ -285,10 +283,7 @@ def _warped(
             maps, affine, size, flags=cv2.INTER_LINEAR, borderMode=border, borderValue=value
         )
 
-    light = grey.astype(np.float32)
-    least = float(np.linalg.svd(matrix, compute_uv=False).min())
-    if least < 1:
-        light = cv2.GaussianBlur(light, (0, 0), SHARPEST_PX * np.sqrt(1 / least**2 - 1))  # type: ignore[assignment]
+    light = smoothed(grey.astype(np.float32), matrix)
     light = cv2.warpAffine(  # type: ignore[assignment]
         light, affine, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
     )

@@ -116,9 +116,7 @@ class Warp:
     def image(self, grey: Image) -> Image:
         """The image float32 (h, w) as the network knows it; beyond its borders it is mirrored."""
         size, move = self._frame(grey.shape)
-        least = float(np.linalg.svd(self.matrix, compute_uv=False).min())
-        if least < 1:  # shrunk: finer detail than a pixel of the smaller image goes first
-            grey = cv2.GaussianBlur(grey, (0, 0), SHARPEST_PX * np.sqrt(1 / least**2 - 1))  # type: ignore[assignment]
+        grey = smoothed(grey, self.matrix)
         affine = np.column_stack([self.matrix, move])
         return cv2.warpAffine(  # type: ignore[return-value]
             grey, affine, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
@@ -156,6 +154,15 @@ class Warp:
         least = corners.min(axis=1)
         across, down = np.ceil(corners.max(axis=1) - least).astype(int) + 1
         return (int(across), int(down)), -least
+
+
+def smoothed(grey: Image, matrix: NDArray[np.float64]) -> Image:
+    """An image (h, w) before ``matrix`` shrinks it: finer detail than a pixel of the smaller image
+    is averaged; as it is where nothing shrinks."""
+    least = float(np.linalg.svd(matrix, compute_uv=False).min())
+    if least >= 1:
+        return grey
+    return cv2.GaussianBlur(grey, (0, 0), SHARPEST_PX * np.sqrt(1 / least**2 - 1))  # type: ignore[return-value]
 
 
 def signs_of(carriers: Carriers) -> NDArray[np.float64]:
