@@ -15,13 +15,15 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.evaluation.protocol import MODES, TARGETS
-from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, FACTS, intended_benchmark
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.render.track import track
+from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, FACTS, TRACK, intended_benchmark
+from fpp_ml_bench.loaders.storage.store import DatasetFolder, datasets_below
 from fpp_ml_bench.loaders.storage.verification import verify
 
 
@@ -54,14 +56,42 @@ def undecoded_share(dataset: DatasetFolder, split: str) -> float:
     return undecoded / counted
 
 
+def write(facts: dict[str, Any], out: Path, name: str) -> None:
+    out.mkdir(exist_ok=True)
+    file = out / f"{name}.json"
+    file.write_text(
+        json.dumps(facts, separators=(",", ":"), sort_keys=True).replace('},"', '},\n"') + "\n"
+    )
+    print(f"{file}: {file.stat().st_size} bytes")
+
+
+def write_track(folder: Path, out: Path) -> int:
+    """The content of each dataset of the track, which was built with the track's settings."""
+    content, datasets = {}, datasets_below(folder)
+    for name, settings in track().items():
+        manifest = DatasetFolder(datasets[name]).manifest
+        described = manifest.settings, manifest.rig
+        findings = verify(datasets[name])
+        if described != (settings.describe(), settings.stated_rig.to_dict()):
+            findings.append(f"{datasets[name]} was not built with the settings of the track")
+        if findings:
+            print("\n".join(map(str, findings)), file=sys.stderr)
+            return 1
+        content[name] = manifest.content
+    write({"content": content, "counts": {}}, out, TRACK.name)
+    return 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument(
-        "name", choices=[benchmark.name for benchmark in BENCHMARKS], metavar="NAME"
+        "name", choices=[benchmark.name for benchmark in (*BENCHMARKS, TRACK)], metavar="NAME"
     )
     parser.add_argument("dataset", type=Path, help="its build")
     parser.add_argument("--out", type=Path, default=FACTS, help="folder to write into")
     args = parser.parse_args()
+    if args.name == TRACK.name:
+        return write_track(args.dataset, args.out)
     dataset = DatasetFolder(args.dataset)
     intended = intended_benchmark(dataset.manifest)
     if intended is None or intended.name != args.name:
@@ -79,12 +109,7 @@ def main() -> int:
             for split in dataset.splits
         },
     }
-    args.out.mkdir(exist_ok=True)
-    file = args.out / f"{args.name}.json"
-    file.write_text(
-        json.dumps(facts, separators=(",", ":"), sort_keys=True).replace('},"', '},\n"') + "\n"
-    )
-    print(f"{file}: {file.stat().st_size} bytes")
+    write(facts, args.out, args.name)
     for split in dataset.splits:
         print(
             f"{split}: {100 * undecoded_share(dataset, split):.4f}% of the pixels that count are "

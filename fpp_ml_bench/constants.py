@@ -33,9 +33,18 @@ PUBLISHED_SPLIT_FOLDERS = {"train": "train", "validation": "val", "test": "test"
 
 VIEW_DEGREES = (0, 60, 120, 180, 240, 300)
 VIEWS = tuple(f"A{degrees}" for degrees in VIEW_DEGREES)
-CONFIGS = ("single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all")
-"""Configurations of a dataset: which frames of a sample are read (paper Section 5.4; ``crossed`` is
-ours, and only of sets with such frames)."""
+CONFIGS = (
+    "single_shot",
+    "crossed",
+    "first_frames",
+    "horizontal",
+    "vertical",
+    "sinusoidal",
+    "all",
+)
+"""Configurations of a dataset: which frames of a sample are read (paper Section 5.4). Ours are
+``crossed``, of sets with such frames, and ``first_frames``: these and the first of each direction,
+what any method of one frame reads."""
 
 OBJECTS = (
     "master_chef_can",

@@ -28,6 +28,9 @@ class RemoteFolder:
     def __str__(self) -> str:
         return self.url
 
+    def __truediv__(self, name: str) -> "RemoteFolder":
+        return RemoteFolder(f"{self.url}/{name}")
+
     def sizes(self) -> dict[str, int]:
         """Bytes of every file below the folder by name; empty where there is no folder."""
         with self._opened("can't be read") as files:

@@ -109,6 +109,7 @@ def columns(sort: str) -> list[Column]:
         RELIANCE,
         ORDER_FREE,
         ROBUSTNESS,
+        RIGS,
         *UNCERTAINTY,
         PROVENANCE,
         LEARNED,
@@ -178,6 +179,18 @@ def robustness(entry: Entry) -> str:
     """Mean two-sided MAE over the disturbed scenes of the test set, mm with one decimal."""
     block = (entry.row.robustness or {}).get("test")
     return NOT_MEASURED if block is None else _measured(entry, block.mae_mm, 1)
+
+
+def rigs(entry: Entry) -> str:
+    """Mean two-sided MAE on the track of rigs in the paper's light, per mille of the standoff; how
+    many rigs have no answer."""
+    block = entry.row.rigs
+    if block is None:
+        return "-"
+    scores = next(iter(block.mean.values()))
+    refused = sum(name.endswith(scores.light) for name in block.refused)
+    without = f" ({refused} refused)" if refused else ""
+    return f"{_measured(entry, scores.per_mille, 1)}{without}"
 
 
 def _measured(entry: Entry, value: float, decimals: int) -> str:
@@ -270,6 +283,7 @@ RANGE = _sparse("Of depth range", partial(error, RANGE_KEY), MIDDLE)
 RATIO = _sparse("x trivial", ratio)
 RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry), from_width=WIDE)
 ORDER_FREE = Column("Without whole periods", lambda row: order_free(row.entry), from_width=WIDE)
+RIGS = _sparse("Any rig, per mille", lambda row: rigs(row.entry), WIDEST)
 ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry), from_width=WIDEST)
 UNCERTAINTY = (
     _sparse("In 95%", lambda row: percent(uncertainty(row.entry).within_95_share), WIDEST),

@@ -25,8 +25,10 @@ from fpp_ml_bench.evaluation.result.file import result_json, write_file
 from fpp_ml_bench.evaluation.result.model import Result, check_charge, check_data, check_reliance
 from fpp_ml_bench.evaluation.result.parts import (
     AxesVersion,
+    BenchmarkInfo,
     Charge,
     DatasetInfo,
+    DatasetScores,
     HardwareInfo,
     Headline,
     Interval,
@@ -37,6 +39,7 @@ from fpp_ml_bench.evaluation.result.parts import (
     Robustness,
     Sha256,
     Timing,
+    TrackScores,
     Uncertainty,
     Whole,
     can_mix,
@@ -139,13 +142,32 @@ class RowRobustness(StrictModel):
         return self
 
 
+class RowTrack(StrictModel):
+    """`TrackScores` in brief: by light the means over the rigs that have an answer and the error of
+    the worst; the error of each dataset, and the names of those without an answer."""
+
+    benchmark: BenchmarkInfo
+    mean: Annotated[dict[Text, DatasetScores], Field(min_length=1, max_length=10)]
+    worst_per_mille: dict[Text, NonNegative]
+    per_mille: Annotated[dict[Text, NonNegative], Field(min_length=1, max_length=100)]
+    refused: list[Text]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "RowTrack":
+        if self.mean.keys() != self.worst_per_mille.keys():
+            raise ValueError("worst_per_mille: expected the lights of mean")
+        if both := self.per_mille.keys() & set(self.refused):
+            raise ValueError(f"{min(both)} has an error, and is among the refused")
+        return self
+
+
 class Row(SparseModel):
     """What is ranked of a result. Means have `DIGITS` significant digits. ``submission`` has its
     run time only in ``timing`` where that is there. ``predictions_sha256`` is over the sorted
     hashes of the prediction files; ``result_sha256`` finds the full result, wherever it is
     published."""
 
-    SPARSE = ("uncertainty", "reliance", "robustness", "charge_mm")
+    SPARSE = ("uncertainty", "reliance", "robustness", "rigs", "charge_mm")
 
     row_schema_version: Literal["3.0.0"]
     submission: Submission
@@ -168,6 +190,7 @@ class Row(SparseModel):
     uncertainty: RowUncertainty | None = None
     reliance: Reliance | None = None
     robustness: dict[Literal["test", "unseen"], RowRobustness] | None = None
+    rigs: RowTrack | None = None
 
     @property
     def per_sample(self) -> list[ObjectMeans]:
@@ -415,6 +438,8 @@ def row_content(result: Result, digits: int | None = DIGITS) -> dict[str, Any]:
         content["reliance"] = in_brief(result.reliance)
     if result.robustness is not None:
         content["robustness"] = {name: in_brief(block) for name, block in result.robustness.items()}
+    if result.rigs is not None:
+        content["rigs"] = in_brief(result.rigs)
     return content
 
 
@@ -450,10 +475,21 @@ def _uncertainty(block: Uncertainty) -> dict[str, float | None]:
     return {"within_95_share": fmean(covered) if covered else None, **errors}
 
 
-def in_brief(block: Reliance | Robustness) -> dict[str, Any]:
+def in_brief(block: Reliance | Robustness | TrackScores) -> dict[str, Any]:
     """What a row holds of a block: a reliance in four digits, of a robustness the content of a
-    `RowRobustness`."""
+    `RowRobustness`, of a track that of a `RowTrack`."""
     content = block.model_dump(mode="json")
+    if isinstance(block, TrackScores):
+        content = {
+            "benchmark": content["benchmark"],
+            "mean": {light: block.mean(light).model_dump() for light in block.lights},
+            "worst_per_mille": {
+                light: block.datasets[block.worst(light)].per_mille for light in block.lights
+            },
+            "per_mille": {name: scores.per_mille for name, scores in block.datasets.items()},
+            "refused": sorted(block.refused),
+        }
+        return rounded(content, 4)  # type: ignore[no-any-return]
     if isinstance(block, Robustness):
         axes, beside = (
             {name: fmean(scores.mae_mm for scores in axis) for name, axis in part.items()}

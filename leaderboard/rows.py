@@ -20,7 +20,7 @@ from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import parse_result, read_json, write_result
 from fpp_ml_bench.evaluation.result.model import Result, disagreements
-from fpp_ml_bench.evaluation.result.parts import Reliance, Robustness
+from fpp_ml_bench.evaluation.result.parts import Reliance, Robustness, TrackScores
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.verification import Verified, difference_lines, of_processors
 from fpp_ml_bench.files import file_content, printable
@@ -68,7 +68,16 @@ _FIELDS = "SHA-256 of a row file, measured or verified, commit, machine, command
 _LINE = re.compile(r"([0-9a-f]{64}) \| (measured|verified) \| [0-9a-f]{40} \| [^|\s][^|]* \| \S.*")
 _NOT_COMPARED: Any = {
     **dict.fromkeys(
-        ("created", "package", "git", "code_sha256", "result_sha256", "reliance", "robustness"),
+        (
+            "created",
+            "package",
+            "git",
+            "code_sha256",
+            "result_sha256",
+            "reliance",
+            "robustness",
+            "rigs",
+        ),
         True,
     ),
     "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"},
@@ -241,19 +250,22 @@ def not_checked(about: Row | Result) -> list[str]:
         is not None,
         "phase reliance": about.reliance is not None,
         "robustness": bool(about.robustness),
+        "the track of rigs": about.rigs is not None,
         "software, code and environment": True,
     }
     return [words for words, there in present.items() if there]
 
 
-def write_block(entry: Entry, block: Reliance | Robustness) -> None:
+def write_block(entry: Entry, block: Reliance | Robustness | TrackScores) -> None:
     """Put a ``block`` into the file of ``entry``, replacing an earlier value, that of a robustness
     on the same set; of a row, in brief. Raises SubmissionError for a block that contradicts the
-    result (other weights, other units)."""
+    result (other weights, other units), and for a track that is none of the named ones."""
     content = read_json(entry.path)
     plain = in_brief(block) if entry.is_row_file else block.model_dump(mode="json")
     if isinstance(block, Robustness):
         content["robustness"] = {**content.get("robustness", {}), block.set: plain}
+    elif isinstance(block, TrackScores):
+        content["rigs"] = plain
     else:
         content["reliance"] = plain
     if entry.is_row_file:

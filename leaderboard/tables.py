@@ -33,6 +33,7 @@ from fpp_ml_bench.leaderboard.columns import (
 )
 from fpp_ml_bench.leaderboard.ranking import MOST_PAIRED, Group, Ranked
 from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER, TEST, UNSEEN, Entry
+from fpp_ml_bench.loaders.render.track import TRACK_LIGHTS
 from fpp_ml_bench.paper import paper_rows
 from fpp_ml_bench.style import interval_text, millimetres
 from fpp_ml_bench.tables import Table, markdown_text
@@ -360,6 +361,12 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
         "phase_reliance": reliance and reliance.score,
         "phase_reliance_without_whole_periods": reliance and reliance.order_free_score,
         "disturbed_mae_mm": disturbed and disturbed.mae_mm,
+        **{
+            f"rigs_{light}_per_mille": about.rigs
+            and light in about.rigs.mean
+            and about.rigs.mean[light].per_mille
+            for light in TRACK_LIGHTS
+        },
         "within_stated_95": stated.within_95_share,
         "ause_mae_mm": stated.ause_mae_mm,
         "sure_mae_mm": stated.sure_mae_mm,

@@ -146,9 +146,8 @@ def stored_groups(sequence: AnySequence, stored: str) -> dict[str, tuple[int, ..
         groups[direction] = tuple(i for i in sequence.sinusoids(direction) if i not in first)
     placed = {i for frames in groups.values() for i in frames}
     groups["codes"] = tuple(i for i in range(len(sequence)) if i not in placed)
-    return {
-        name: f for name, f in groups.items() if name == DATA_GROUP or (f and indices.issuperset(f))
-    }
+    kept = {name: tuple(i for i in frames if i in indices) for name, frames in groups.items()}
+    return {name: frames for name, frames in {**kept, DATA_GROUP: first}.items() if frames}
 
 
 def stored_frames(sequence: AnySequence, stored: str) -> tuple[int, ...]:

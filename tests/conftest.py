@@ -26,7 +26,7 @@ TINY_SIZE = 176
 TINY_OBJECTS = ("bowl", "cork", "mug", "power_drill")
 """Two objects of the training split, so that a shard holds two, and one object of each other
 split."""
-TINY_CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
+TINY_CONFIGS = ("single_shot", "first_frames", "horizontal", "vertical", "sinusoidal", "all")
 """Configurations of the paper's sequence: all but crossed."""
 
 

@@ -37,6 +37,7 @@ from fpp_ml_bench.evaluation.result.parts import (
     SampleResult,
     SigmaScores,
     Sparsification,
+    TrackScores,
     Uncertainty,
 )
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, Scored, SigmaSample, combine
@@ -90,11 +91,12 @@ class Result(SparseModel, _Scores, _Rules):
     """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in
     ``environment``."""
 
-    SPARSE = ("reliance", "robustness", "uncertainty", "charge_mm")
+    SPARSE = ("reliance", "robustness", "rigs", "uncertainty", "charge_mm")
 
     environment: parts.Environment
     reliance: Reliance | None = None
     robustness: dict[Literal["test", "unseen"], Robustness] | None = None
+    rigs: TrackScores | None = None
     uncertainty: Uncertainty | None = None
 
     @property
@@ -132,6 +134,10 @@ class Result(SparseModel, _Scores, _Rules):
             _check_uncertainty(
                 self.uncertainty, {row.sample: row for row in self.per_sample}, self.metrics
             )
+        if self.rigs is not None:
+            _check_weights("rigs", self.rigs.weights_sha256, self.submission)
+            if self.rigs.method != self.submission.method:
+                raise ValueError(f"rigs is that of the method {self.rigs.method}")
         for name, block in (self.robustness or {}).items():
             _check_weights("robustness", block.weights_sha256, self.submission)
             if name != block.set:

@@ -513,6 +513,67 @@ class Robustness(StrictModel):
         return self
 
 
+class DatasetScores(StrictModel):
+    """A method on one dataset of a track, means over its samples against the exact depth. ``mae_mm``
+    is the protocol's two-sided MAE; ``per_mille``: of the rig's standoff; ``projector_px``: as far
+    as a change of depth by it moves the pattern's image at the standoff; ``of_decoded``: over the
+    MAE of the depth that the dataset's many frames decode, where they do, null for a perfect one;
+    ``answered_per_mille``: MAE of the object's pixels with an answer, null without any.
+    Shares of the object's pixels: missing, and invented ones of the background over them."""
+
+    light: Text
+    mae_mm: NonNegative
+    per_mille: NonNegative
+    answered_per_mille: NonNegative | None
+    projector_px: NonNegative
+    of_decoded: NonNegative | None
+    missing_share: Share
+    invented_share: NonNegative
+
+
+class TrackScores(StrictModel):
+    """A method on rigs in lights: ``datasets`` by name, and by name why it has no answer to the
+    ``refused`` ones. ``benchmark`` is the track where all its datasets have the content of one that
+    is named, null for others."""
+
+    benchmark: BenchmarkInfo | None
+    name: Text
+    method: Text
+    weights_sha256: Sha256 | None
+    datasets: Annotated[dict[Text, DatasetScores], Field(min_length=1, max_length=1000)]
+    refused: dict[Text, Text]
+
+    @property
+    def title(self) -> str:
+        known = self.benchmark
+        return f"{known.name} version {known.version}" if known else "no named track"
+
+    @property
+    def lights(self) -> list[str]:
+        """The lights that have a score, in the order of the datasets."""
+        return list(dict.fromkeys(scores.light for scores in self.datasets.values()))
+
+    def mean(self, light: str) -> DatasetScores:
+        """Mean over the rigs that have an answer in ``light``; one of `lights`."""
+        rows = [scores for scores in self.datasets.values() if scores.light == light]
+        means: dict[str, Any] = {"light": light}
+        for key in DatasetScores.model_fields.keys() - {"light"}:
+            values = [value for row in rows if (value := getattr(row, key)) is not None]
+            means[key] = math.fsum(values) / len(values) if values else None
+        return DatasetScores(**means)
+
+    def worst(self, light: str) -> str:
+        """The dataset in ``light``, one of `lights`, of the largest error per mille."""
+        of_light = {name: row for name, row in self.datasets.items() if row.light == light}
+        return max(of_light, key=lambda name: of_light[name].per_mille)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "TrackScores":
+        if both := sorted(self.datasets.keys() & self.refused.keys()):
+            raise ValueError(f"{both[0]} has scores, and a reason why it has none")
+        return self
+
+
 def check_measured(
     interval: Sequence[float | None], samples: int, objects: int, most: float = math.inf
 ) -> None:

@@ -32,6 +32,8 @@ REPORTS_FILE = "per_sample.json"
 """What a method may report of each sample beside its predictions; it is not scored."""
 UNFINISHED_FILE = "unfinished.jsonl"
 """What `baselines.run.predict_split` goes on from, until all predictions are there."""
+REFUSED_FILE = "refused.txt"
+"""Why a method has no predictions of a dataset, in their place."""
 _MAX_BYTES = 65536
 
 

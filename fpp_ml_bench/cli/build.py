@@ -1,6 +1,7 @@
 """``fpp-bench build``: generate the benchmark."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Literal
@@ -9,19 +10,26 @@ from fpp_ml_bench.cli.console import contents, progress_bar, say_benchmark
 from fpp_ml_bench.cli.options import Explain, Pool, command, names, value, whole
 from fpp_ml_bench.coding.gray_code import bits_needed
 from fpp_ml_bench.constants import CONFIGS, LARGEST_SIDE_PX, PRESETS
+from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.builder import assembly_of, explain_build
 from fpp_ml_bench.loaders.render.builder import build as build_dataset
 from fpp_ml_bench.loaders.render.light import NAMED as NAMED_LIGHTS
 from fpp_ml_bench.loaders.render.light import load_light
 from fpp_ml_bench.loaders.render.meshes import read_mesh_list, single_mesh
-from fpp_ml_bench.loaders.render.scene import BuildSettings, default_frames, volume_scale
+from fpp_ml_bench.loaders.render.scene import (
+    BuildSettings,
+    default_frames,
+    light_of_volume,
+    volume_scale,
+)
 from fpp_ml_bench.loaders.render.sensor import camera_noise
+from fpp_ml_bench.loaders.render.track import TRACK, track
 from fpp_ml_bench.loaders.storage.card import ground_truth_summary
+from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
-from fpp_ml_bench.optics.rig import middle_m
 from fpp_ml_bench.optics.rig_file import load_rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS
-from fpp_ml_bench.options import REQUIRED, option
+from fpp_ml_bench.options import REQUIRED, flag_of, option
 from fpp_ml_bench.remote import RemoteFolder, place
 
 
@@ -35,7 +43,11 @@ class BuildCommandSettings(Explain, Pool):
         "DIR",
         parse=place,
     )
-    preset: str = option("mini", "objects and size (default: mini)", choices=tuple(PRESETS))
+    preset: str = option(
+        "mini",
+        "objects and size (default: mini); rigs: the track of sixteen rigs, a dataset each and light",
+        choices=(*PRESETS, TRACK),
+    )
     size: int | None = option(
         None,
         "image width and height (default: the preset's)",
@@ -136,12 +148,10 @@ def settings_of(given: BuildCommandSettings) -> "BuildSettings":
     scale = given.object_scale
     if scale is None:
         scale = 1.0 if given.rig in NAMED_RIGS or not objects else volume_scale(rig)
-    if scale != 1:  # the light is that of the scaled world
-        own_focus_m = light.projector.focus_m / scale
-        middle = middle_m(rig.times(1 / scale).working_range_mm)
-        light = light.changed(
-            "projector", focus_m=middle if given.light in NAMED_LIGHTS else own_focus_m
-        )
+    if given.light in NAMED_LIGHTS:
+        light = light_of_volume(light, rig, scale)
+    elif scale != 1:
+        light = light.changed("projector", focus_m=light.projector.focus_m / scale)
     return BuildSettings(
         rig, everything, given.placement, stored, given.seed, light, own, decoding_rig, scale
     )
@@ -159,6 +169,7 @@ fpp-bench build --out data/workshop --preset full --light workshop     the same 
 fpp-bench build --out data/test --preset test --light hard         the test objects alone, to score in that light
 fpp-bench build --out data/mine --mesh part.stl --size 960         a mesh of yours (metres)
 fpp-bench build --out data/lab --decode-with found.yaml            ground truth by the rig that a calibration found
+fpp-bench build --out data/rigs --preset rigs                      the track of 16 rigs, 32 datasets in a folder
 fpp-bench build --out s3://bucket/full --preset full --cluster ray://head:10001    on all nodes of a Ray cluster
 fpp-bench build --out data/pen --objects pen --explain             what was left out
 """
@@ -166,33 +177,69 @@ fpp-bench build --out data/pen --objects pen --explain             what was left
 def build(settings: BuildCommandSettings) -> None:
     """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground
     truth."""
-    build_settings, workers = settings_of(settings), settings.processes
-    assembly = assembly_of(build_settings)
-    rows = sum(len(plan.samples) for plan in assembly.plans)
-    frames = len(assembly.manifest.stored_frames)
-    out, steps = settings.out, list[int]()
-    started = perf_counter()
-    with progress_bar("building", rows, "samples") as advance:
-
-        def count(finished: int) -> None:
-            steps.append(finished)
-            advance(finished)
-
-        manifest = build_dataset(out, build_settings, workers, count, settings.cluster)
-    seconds = perf_counter() - started
-    # The first step is what an interrupted run had left: it took no time now.
-    made = sum(steps[1:]) * frames
-    rate = (
-        f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)"
-        if made
-        else "complete already"
-    )
-    print(f"{out}: {contents(manifest)}; {rate}")
+    if settings.preset == TRACK:
+        _build_track(settings)
+        return
+    build_settings = settings_of(settings)
+    samples = sum(len(plan.samples) for plan in assembly_of(build_settings).plans)
+    with progress_bar("building", samples, "samples") as advance:
+        manifest, rate = _built(settings.out, build_settings, settings, advance)
+    print(f"{settings.out}: {contents(manifest)}; {rate}")
     if (scale := build_settings.object_scale) != 1:
         print(f"  objects, textures and focus are {scale:g} times as large as in the benchmark")
     for line in ground_truth_summary(manifest):
         print(f"  {line}")
     say_benchmark(manifest)
-    if isinstance(out, Path):
-        print(f"next: fpp-bench info {out}")
+    if isinstance(settings.out, Path):
+        print(f"next: fpp-bench info {settings.out}")
     settings.say(lambda: explain_build(manifest, build_settings))
+
+
+def _built(
+    out: Path | RemoteFolder,
+    settings: BuildSettings,
+    given: BuildCommandSettings,
+    advance: Callable[[int], None],
+) -> tuple[Manifest, str]:
+    """A dataset's manifest once it is built, and how fast that went."""
+    steps = list[int]()
+
+    def count(finished: int) -> None:
+        steps.append(finished)
+        advance(finished)
+
+    started = perf_counter()
+    manifest = build_dataset(out, settings, given.processes, count, given.cluster)
+    seconds = perf_counter() - started
+    # The first step is what an interrupted run had left: it took no time now.
+    made = sum(steps[1:]) * len(manifest.stored_frames)
+    return manifest, (
+        f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)"
+        if made
+        else "complete already"
+    )
+
+
+_OF_A_TRACK = ("out", "preset", "workers", "cluster")
+
+
+def _build_track(given: BuildCommandSettings) -> None:
+    """Every dataset of the track of rigs below the folder that is ``given``, finished ones kept.
+    Raises `BuildError` for options that would make another track of it."""
+    for entry in fields(given):
+        if entry.name not in _OF_A_TRACK and getattr(given, entry.name) != entry.default:
+            raise BuildError(
+                f"{flag_of(entry)}: the preset {TRACK} has rigs, lights, objects and sizes of its own; "
+                f"leave it out, or build a set of yours with another preset"
+            )
+    datasets = track()
+    samples = sum(len(settings.objects) * len(settings.views) for settings in datasets.values())
+    with progress_bar("building", samples, "samples") as advance:
+        built = {
+            name: _built(given.out / name, settings, given, advance)
+            for name, settings in datasets.items()
+        }
+    for name, (manifest, rate) in built.items():
+        print(f"{given.out / name}: {contents(manifest)}; {rate}")
+        say_benchmark(manifest)
+    print(f"next: fpp-bench predict METHOD {given.out} --out predictions")

@@ -25,6 +25,7 @@ LISTED = 20
     """\
 fpp-eval predictions --json result.json
 fpp-eval predictions data/mini --split test --target depth_exact --report report
+fpp-eval predictions-rigs data/rigs --json rigs.json      a table of all rigs, per mille of depth
 """
 )
 def score_folder(
@@ -38,7 +39,8 @@ def score_folder(
         "PREDICTIONS",
     ),
     dataset: Path | None = argument(
-        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml)",
+        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml), or "
+        "of several, of a track of rigs, whose predictions are in folders of the same names",
         "DATASET",
         None,
     ),
@@ -79,6 +81,12 @@ def score_folder(
         flag="--report",
         parse=new_folder,
     ),
+    into: Path | None = option(
+        None,
+        "of a track of rigs: write its scores into this result or leaderboard row of the same "
+        "method (.json)",
+        "FILE",
+    ),
     account: Explain,
 ) -> None:
     """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the
@@ -89,9 +97,17 @@ def score_folder(
     from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
     from fpp_ml_bench.evaluation.score.evaluator import explain_eval
     from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
+    from fpp_ml_bench.loaders.storage.store import datasets_below
 
     prepare_process()
     _check_outputs(json, page, predictions)
+    if dataset is not None and (datasets := datasets_below(dataset)):
+        _score_track(predictions, datasets, json, page, into)
+        return
+    if into is not None:
+        raise SubmissionError(
+            f"--into {into}: is for the scores of a track of rigs; use --json FILE"
+        )
     opened, split = scored_data(predictions, dataset, split)
     notes: list[str] = []
     scored = evaluate_folder(predictions, opened, split, target, edge_band, mode, say=notes.append)
@@ -114,6 +130,40 @@ def score_folder(
     for note in notes:
         print(f"fpp-eval: note: {note}", file=sys.stderr)
     account.say(lambda: explain_eval(opened, split, target))
+
+
+def _score_track(
+    predictions: Path,
+    datasets: dict[str, Path],
+    json: Path | None,
+    page: Path | None,
+    into: Path | None,
+) -> None:
+    """Score a folder of predictions of several rigs. A file that can't take the scores is refused
+    before anything is scored."""
+    from fpp_ml_bench.cli.console import progress_bar, show
+    from fpp_ml_bench.evaluation.result.file import write_json
+    from fpp_ml_bench.evaluation.score.track import score_track, track_table
+    from fpp_ml_bench.leaderboard.rows import read_entry, write_block
+
+    if page is not None:
+        raise SubmissionError(
+            f"--report {page}: is of one dataset; give one of {', '.join(datasets)} and its "
+            f"predictions"
+        )
+    entry = None if into is None else read_entry(into)
+    with progress_bar("scoring", len(datasets), "datasets") as advance:
+        scores = score_track(predictions, datasets, advance)
+    if json is not None:
+        write_json(scores.model_dump(mode="json"), json)
+    if entry is not None:
+        write_block(entry, scores)
+    show(track_table(scores))
+    for name, reason in scores.refused.items():
+        print(f"{name}: refused. {reason}")
+    for written in (json, into):
+        if written is not None:
+            print(f"Written: {written}")
 
 
 def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[DatasetFolder, str]":

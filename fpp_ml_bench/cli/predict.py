@@ -7,14 +7,18 @@ from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.baselines.run import explain_predict, predict_split
 from fpp_ml_bench.baselines.timing import check_target, time_method, write_timing
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command, new_file
+from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import Timing
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.evaluation.submission.prediction_files import REFUSED_FILE, SUBMISSION_FILE
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.loaders.storage.store import DatasetFolder, datasets_below
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
 
@@ -27,6 +31,7 @@ fpp-bench predict unet.safetensors data/mini --out predictions-unet
 fpp-bench predict phase data/mini --frames 3 --out predictions-3
 fpp-bench predict phase data/mini --error-mm 3 --out predictions-fewest     frames chosen scene by scene
 fpp-bench predict mine.py:Mine data/mini --out predictions-mine             a method of yours
+fpp-bench predict crossed data/rigs --out predictions-rigs                  all rigs of a track
 fpp-eval predictions --target depth_exact --json result.json
 """,
     MethodCommand,
@@ -34,7 +39,7 @@ fpp-eval predictions --target depth_exact --json result.json
 def predict(
     *,
     chosen: MethodSettings,
-    dataset: Path = argument("dataset folder", "DATASET"),
+    dataset: Path = argument("dataset folder, or a folder of datasets", "DATASET"),
     split: str = option("test", "default: test", choices=SPLITS),
     out: Path | RemoteFolder = option(
         REQUIRED,
@@ -45,6 +50,10 @@ def predict(
     account: Explain,
 ) -> None:
     """Run a method over a split and write predictions that fpp-eval scores."""
+    if datasets := datasets_below(dataset):
+        _predict_all(chosen, datasets, split, out)
+        print(f"next: fpp-eval {out} {dataset} --json rigs.json")
+        return
     opened = DatasetFolder(dataset)
     method = chosen.load(opened)
     opened = opened.without_truth()  # the method can look at its caller
@@ -52,17 +61,52 @@ def predict(
     bar = progress_bar(f"{chosen.name}, {split}", samples, "samples", shown=False)
     with working_copy(out) as (folder, _), bar as advance:
         seconds = predict_split(opened, method, split, folder, advance)
-    frames = "1 frame" if len(method.frames_used) == 1 else f"{len(method.frames_used)} frames"
-    print(
-        f"{out}: {samples} predictions by {method.title}; {frames} and {seconds:.3f} s a sample "
-        f"(median)"
-    )
+    print(f"{out}: {_predicted(method, samples, seconds)}")
     how = f"{_scoring(method, opened)} --json result.json"
     if isinstance(out, Path):
         print(f"next: fpp-eval {out}{how}")
     else:
         print(f"next: copy {out} to a disk, then: fpp-eval COPY {dataset}{how}")
     account.say(lambda: explain_predict(opened, method, split))
+
+
+def _predicted(method: Method, samples: int, seconds: float) -> str:
+    frames = "1 frame" if len(method.frames_used) == 1 else f"{len(method.frames_used)} frames"
+    return (
+        f"{samples} predictions by {method.title}; {frames} and {seconds:.3f} s a sample (median)"
+    )
+
+
+def _predict_all(
+    chosen: MethodSettings, datasets: dict[str, Path], split: str, out: Path | RemoteFolder
+) -> None:
+    """Predict each of ``datasets`` into a folder of its name, finished ones kept. Where the method
+    can't be for the rig, the folder says so."""
+    find(chosen.name)  # an unknown method is refused by no rig
+    opened = {name: DatasetFolder(place) for name, place in datasets.items()}
+    samples = sum(len(dataset.samples(split)) for dataset in opened.values())
+    said = {}
+    bar = progress_bar(f"{chosen.name}, {split}", samples, "samples", shown=False)
+    with working_copy(out) as (below, save), bar as advance:
+        for name, dataset in opened.items():
+            count, folder = len(dataset.samples(split)), below / name
+            if (folder / SUBMISSION_FILE).is_file():
+                said[name] = f"{count} predictions, complete already"
+                advance(count)
+                continue
+            try:
+                method = chosen.load(dataset)
+            except PredictionError as refusal:
+                folder.mkdir(parents=True, exist_ok=True)
+                write_atomically(folder / REFUSED_FILE, f"{refusal}\n".encode())
+                said[name] = f"refused: {refusal}"
+                advance(count)
+                continue
+            seconds = predict_split(dataset.without_truth(), method, split, folder, advance)
+            said[name] = _predicted(method, count, seconds)
+            save()
+    for name, words in said.items():
+        print(f"{out / name}: {words}")
 
 
 def _scoring(method: Method, opened: "DatasetFolder") -> str:

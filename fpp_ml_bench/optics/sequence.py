@@ -168,9 +168,11 @@ class AnySequence(ABC):
         horizontal, vertical = self.sinusoids("horizontal"), self.sinusoids("vertical")
         crossed = self.crossed_frames
         single = ((0,) if 0 in crossed else horizontal or vertical or crossed or (0,))[:1]
+        first = (*crossed, *horizontal[:1], *vertical[:1])
         frames = (
             single,
             crossed,
+            first if len(first) > 1 else (),
             horizontal,
             vertical,
             horizontal + vertical,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.calibration.result import volume_error_mm
-from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
+from fpp_ml_bench.constants import SPLITS, sample_name, split_of
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -51,7 +51,8 @@ def plan_build(settings: BuildSettings) -> list[ShardPlan]:
         ]
         if names:
             objects = {
-                name: [(sample_name(name, view), name, view) for view in VIEWS] for name in names
+                name: [(sample_name(name, view), name, view) for view in settings.views]
+                for name in names
             }
             plans += plan_shards(split, objects)
     return plans

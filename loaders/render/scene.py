@@ -32,7 +32,7 @@ from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
 from fpp_ml_bench.optics.pinhole import Pinhole
-from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig import Rig, middle_m
 from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.portable import cosine_of_turns, matrix_product, sine_of_turns
 
@@ -73,7 +73,7 @@ class BuildSettings:
     ``rig`` photographs. ``decode_with`` is what a calibration found of it: the ground truth is
     decoded with that rig, and it is the dataset's, as in a lab. ``object_scale``: how many times
     their size the benchmark's objects have, with all that is on them and the lens's focus; users'
-    meshes keep theirs.
+    meshes keep theirs. ``views``: those of `VIEWS` that are photographed.
 
     ``objects`` and ``user_meshes`` are kept in one order, the benchmark's, the unseen ones and then
     the users' by name, whatever order they were given in: it is the order of the rows.
@@ -88,6 +88,7 @@ class BuildSettings:
     user_meshes: tuple[UserMesh, ...] = field(default=())
     decode_with: Rig | None = None
     object_scale: float = 1.0
+    views: tuple[str, ...] = VIEWS
 
     def __post_init__(self) -> None:
         if not 0 < self.object_scale < math.inf:
@@ -109,6 +110,8 @@ class BuildSettings:
             raise BuildError(f"placement {self.placement!r}: expected {' or '.join(PLACEMENTS)}")
         if self.stored not in CONFIGS:
             raise BuildError(f"frames {self.stored!r}: expected one of {', '.join(CONFIGS)}")
+        if not self.views or list(self.views) != [view for view in VIEWS if view in self.views]:
+            raise BuildError(f"views {self.views!r}: expected some of {', '.join(VIEWS)}, in order")
         if not 0 <= self.seed < 2**63:
             raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
         self.rig.check_sampling()
@@ -169,6 +172,8 @@ class BuildSettings:
         }
         if self.object_scale != 1:
             described["object_scale"] = self.object_scale
+        if self.views != VIEWS:
+            described["views"] = list(self.views)
         return (
             described
             if self.decode_with is None
@@ -253,6 +258,14 @@ def volume_scale(rig: Rig) -> float:
         return 1.0
     digits = 2 - math.floor(math.log10(scale))
     return math.floor(scale * 10**digits) / 10**digits
+
+
+def light_of_volume(light: Light, rig: Rig, scale: float) -> Light:
+    """``light``, one of the named, in a world whose objects are ``scale`` times as large: focused in
+    the middle of the rig's range, in the unit of `BuildSettings.unit_rig`."""
+    if scale == 1:
+        return light
+    return light.changed("projector", focus_m=middle_m(rig.times(1 / scale).working_range_mm))
 
 
 def _half_view(camera: Pinhole) -> float:

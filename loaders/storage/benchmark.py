@@ -65,8 +65,8 @@ class Benchmark:
         )
 
     @property
-    def content(self) -> dict[str, str]:
-        """``split/column`` -> hash, as `Manifest.content`."""
+    def content(self) -> dict[str, Any]:
+        """``split/column`` -> hash, as `Manifest.content`; of the track, that of each dataset."""
         return self._facts["content"]  # type: ignore[no-any-return]
 
     def counts(self, split: str, mode: str, target: str) -> dict[str, Counts]:
@@ -96,6 +96,16 @@ BENCHMARKS = (
 )
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset small`
 trains on."""
+
+
+TRACK = Benchmark("fpp-bench-rigs", 1, "rigs", 0)
+"""The track of rigs (`loaders.render.track`): its facts are the content of each of its datasets."""
+
+
+def known_track(content: Mapping[str, Mapping[str, str]]) -> Benchmark | None:
+    """The track whose datasets, all of them, have ``content`` (by dataset ``split/column`` ->
+    hash); None for others."""
+    return TRACK if content and dict(content) == TRACK.content else None
 
 
 def benchmark_of(content: Mapping[str, str]) -> Benchmark | None:
@@ -159,6 +169,9 @@ def benchmark_sentence(manifest: Manifest) -> tuple[bool, str]:
     """A sentence about what a dataset is by its manifest; False beside it for a benchmark's
     settings with other content."""
     benchmark, intended = benchmark_of(manifest.content), intended_benchmark(manifest)
+    for name, content in TRACK.content.items():
+        if content == manifest.content:
+            return True, f"this is {name} of {TRACK.title}"
     if benchmark is not None:
         lacking = len(benchmark.content) > len(manifest.content)
         return (

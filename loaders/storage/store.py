@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import CONFIGS, SPLITS, TRAIN
 from fpp_ml_bench.depth import RangeRule, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.files import cause_of, opened, printable
+from fpp_ml_bench.files import cause_of, is_file, opened, printable
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
@@ -492,6 +492,14 @@ class _Skeleton(io.RawIOBase):
         raise ValueError("a buffer that is compressed, or leads elsewhere")
 
 
+def datasets_below(folder: Path) -> dict[str, Path]:
+    """The dataset folders directly below ``folder`` by name; none of a folder that is a dataset, or
+    is none."""
+    if is_file(folder / MANIFEST) or not folder.is_dir():
+        return {}
+    return {path.name: path for path in sorted(folder.iterdir()) if is_file(path / MANIFEST)}
+
+
 def load_dataset(
     folder: str | Path, config: str = "single_shot", split: str | None = None
 ) -> "Dataset | DatasetDict":
@@ -501,9 +509,10 @@ def load_dataset(
     ----------
     folder : str or Path
         Dataset written by ``fpp-bench build`` or ``fpp-bench import``.
-    config : {"single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all"}
-        Which frames: the first one, the crossed ones of a rig that has them, those of a direction, all sinusoids, or
-        the whole sequence.
+    config : {"single_shot", "crossed", "first_frames", "horizontal", "vertical", "sinusoidal",
+        "all"}
+        Which frames: the first one, the crossed ones of a rig that has them, these and the first of each
+        direction, those of a direction, all sinusoids, or the whole sequence.
     split : {"train", "validation", "test"}, optional
         None for all of them, as a ``DatasetDict``.
 

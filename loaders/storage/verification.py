@@ -171,7 +171,8 @@ def _split_findings(manifest: Manifest) -> list[str]:
                 findings.append(
                     f"object {name!r} is in two splits, {home[name]} and {split}: scores would leak"
                 )
-            expected_views = set(seen) if manifest.origin == CAPTURED else VIEWS
+            stated = manifest.settings.get("views", VIEWS)
+            expected_views = set(seen) if manifest.origin == CAPTURED else stated
             if sorted(seen) != sorted(expected_views):
                 expected, actual = ", ".join(expected_views), ", ".join(seen)
                 findings.append(

@@ -286,7 +286,7 @@ def test_info_for_people(tiny, opened, capsys):
         "baseline 160.1 mm",
         "1500-2100 mm",
         "ground-truth error",
-        "single_shot, horizontal",
+        "single_shot, first_frames, horizontal",
     ):
         assert text in out
 

@@ -215,7 +215,8 @@ def test_mini_preset_has_every_split():
     ("stored", "count", "configs"),
     [
         ("single_shot", 1, {"single_shot"}),
-        ("vertical", 19, {"single_shot", "vertical"}),
+        ("vertical", 19, {"single_shot", "first_frames", "vertical"}),
+        ("first_frames", 2, {"single_shot", "first_frames"}),
         ("all", 52, set(TINY_CONFIGS)),
     ],
 )
