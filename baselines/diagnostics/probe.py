@@ -157,6 +157,7 @@ PROBES = {
     "flat-plane": "FlatPlane",
     "counterfactual": "Counterfactual",
     "theory": "Theory",
+    "identifiability": "Identifiability",
 }
 """The probes in the order of the report, and their classes; each is in the module of its name,
 which is imported when it runs."""

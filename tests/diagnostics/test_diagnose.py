@@ -175,7 +175,7 @@ def test_a_network_that_predicts_nothing_gets_a_sentence_and_no_ratio(
     for name in set(PROBES) - {"theory"}:
         assert findings[name]["skipped"] == sentence and findings[name]["values"] == {}
     assert findings["theory"]["skipped"] is None
-    assert (out / "index.html").read_text().count(f"Not run: {sentence}") == 4
+    assert (out / "index.html").read_text().count(f"Not run: {sentence}") == 5
     assert "R2" not in capsys.readouterr().out
 
 

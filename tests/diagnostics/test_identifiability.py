@@ -1,0 +1,121 @@
+"""The bound of what one frame tells, against a search along the rays with the rig's own
+projection."""
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines.diagnostics.identifiability import SAME_RAD, alike, shares
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.loaders.render.track import track
+from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
+
+SIZE = 96
+TAU = 2 * np.pi
+
+
+def _surface(rig, size: int, seed: int = 0) -> np.ndarray:
+    """A smooth surface in the middle of the image and the range."""
+    near, far = rig.working_range_mm
+    rows, columns = np.mgrid[: rig.camera.height, : rig.camera.width].astype(np.float64)
+    middle = near + (far - near) * np.random.default_rng(seed).uniform(0.3, 0.7)
+    depth = middle + 0.1 * (far - near) * np.sin(3 * columns / rig.camera.width)
+    depth += 0.05 * (far - near) * rows / rig.camera.height
+    inside = (np.abs(rows / rig.camera.height - 0.5) < size / 200) & (
+        np.abs(columns / rig.camera.width - 0.5) < size / 200
+    )
+    return np.where(inside, depth, 0).astype(np.float32)
+
+
+def _along_ray(rig, row: int, column: int, count: int = 60001):
+    """Depths in range on a pixel's ray, and the projector px that they are seen at."""
+    near, far = rig.working_range_mm
+    depth = np.linspace(near, far, count)
+    x, y = (axis[row, column] for axis in rig.camera.rays())
+    return depth, *rig.project(np.column_stack([x * depth, y * depth, depth]) / 1000)
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+@pytest.mark.parametrize("name", ["paper", "rig-12-paper"])
+def test_orders_of_one_carrier_are_those_of_a_search(name, direction) -> None:
+    rig = paper_rig(SIZE) if name == "paper" else track()[name].rig
+    depth_mm = _surface(rig, 20)
+    found = alike(rig, direction, depth_mm)
+    rows, columns = np.nonzero(depth_mm)
+    for place in np.linspace(0, len(rows) - 1, 7).astype(int):
+        row, column = rows[place], columns[place]
+        depth, u, v = _along_ray(rig, row, column)
+        turns = (v if direction == "horizontal" else u) / rig.pitch(direction)
+        own = np.interp(depth_mm[row, column], depth, turns)
+        expected = [
+            float(
+                np.interp(
+                    level, *(part[:: int(np.sign(turns[-1] - turns[0]))] for part in (turns, depth))
+                )
+            )
+            for level in own + np.arange(-12, 13)
+            if turns.min() <= level <= turns.max()
+        ]
+        inside = row - found.crop[0].start, column - found.crop[1].start
+        given = found.depth_mm[:, *inside]
+        given = np.sort(given[found.fits["phase"][:, *inside]])
+        assert np.allclose(given, np.sort(expected), atol=0.3)
+
+
+def test_pairs_of_phases_are_those_of_a_search() -> None:
+    for rig in (crossed_rig(SIZE, "crossed-18"), track()["rig-04-paper"].rig):
+        depth_mm = _surface(rig, 16, seed=3)
+        found = alike(rig, "crossed", depth_mm)
+        rows, columns = np.nonzero(depth_mm)
+        for place in np.linspace(0, len(rows) - 1, 5).astype(int):
+            row, column = rows[place], columns[place]
+            depth, u, v = _along_ray(rig, row, column)
+            phases = [TAU * (a * u + b * v) for a, b in rig.crossed.cycles_per_px]
+            own = [np.interp(depth_mm[row, column], depth, phase) for phase in phases]
+            apart = np.hypot(
+                *((phase - at + np.pi) % TAU - np.pi for phase, at in zip(phases, own, strict=True))
+            )
+            low = np.flatnonzero((apart[1:-1] < apart[:-2]) & (apart[1:-1] < apart[2:])) + 1
+            for words, rad in SAME_RAD.items():
+                expected = depth[low[apart[low] < rad]]
+                if np.any(np.abs(apart[low] - rad) < 0.02):  # at the limit either may be right
+                    continue
+                inside = row - found.crop[0].start, column - found.crop[1].start
+                fits = found.fits[f"phases to {rad:g} rad, {words}"][:, *inside]
+                assert np.allclose(np.sort(found.depth_mm[:, *inside][fits]), expected, atol=1.0)
+
+
+def test_brightness_parts_orders_of_a_matte_surface() -> None:
+    rig = paper_rig(240)
+    found = alike(rig, "horizontal", _surface(rig, 30))
+    none, some, most = found.fits.values()
+    assert (most <= some).all() and (some <= none).all() and most[0].sum() == none[0].sum()
+    assert most.sum() <= some.sum() < none.sum()
+
+
+def test_wrong_orders_are_lawful_or_avoidable() -> None:
+    rig = paper_rig(240)
+    depth_mm = _surface(rig, 30)
+    found = alike(rig, "horizontal", depth_mm)
+    fits = found.fits["phase"]
+    other = np.where(fits[1:], found.depth_mm[1:], np.nan)
+    nearest = np.nanmin(np.where(np.isnan(other), np.inf, other), axis=0)
+    answer = np.zeros_like(depth_mm)
+    answer[found.crop] = np.where(np.isfinite(nearest), nearest, 0)
+    facts = shares(found, answer)
+    twice = (fits.sum(axis=0) > 1)[fits[0]].mean()
+    assert facts["wrong order"] == pytest.approx(twice)
+    assert facts["avoidable, phase"] == 0
+    assert facts["avoidable, phase and brightness to 3%"] > 0.5 * twice
+    assert shares(found, depth_mm)["wrong order"] == 0
+    assert "wrong order" not in shares(found, None)
+    assert facts["one depth, phase"] == pytest.approx(1 - twice)
+    with pytest.raises(DiagnosisError, match="object"):
+        alike(rig, "horizontal", np.zeros_like(depth_mm))
+
+
+def test_the_probe_reports_the_bound_and_the_errors(tiny, tmp_path, capsys) -> None:
+    words = ["diagnose", "phase", str(tiny), "--probe", "identifiability", "--quick"]
+    assert main([*words, "--out", str(tmp_path / "report")]) == 0
+    assert "Object pixels with one depth" in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "report" / "identifiability.png").is_file()
