@@ -32,7 +32,7 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AnySequence
-from fpp_ml_bench.options import did_you_mean, option
+from fpp_ml_bench.options import did_you_mean
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.training.weights import ModelConfig, NetConfig, TrainingBenchmark
@@ -95,25 +95,6 @@ class Assumption(NamedTuple):
 @dataclass(frozen=True)
 class NoOptions:
     """Options of a method that has none."""
-
-
-@dataclass(frozen=True)
-class OwnViews:
-    """Options of a training that renders what it learns from; None: as the shipped weights were
-    trained."""
-
-    steps: int | None = option(None, "training steps (default: as the shipped weights)", "N")
-    unions: int | None = option(
-        None,
-        "images that join several objects, made from each sample (default: as the shipped weights)",
-        "N",
-    )
-    lights: int | None = option(
-        None, "lights that are drawn at random (default: as the shipped weights)", "N"
-    )
-    rate: float | None = option(
-        None, "largest learning rate (default: as the shipped weights)", "R"
-    )
 
 
 class Method:

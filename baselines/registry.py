@@ -35,11 +35,8 @@ FILE_MARK = ".py:"
 """What tells ``mine.py:Mine`` from a name."""
 BUILT_IN = (
     "classical:ClassicalMethod",
-    "learned.method:ClassicalNetMethod",
     "phase.method:PhaseMethod",
-    "learned.method:PhaseNetMethod",
     "phase.method:CrossedMethod",
-    "learned.method:CrossedNetMethod",
     "learned.method:FringeNetMethod",
     "trivial:ConstantMethod",
     "trivial:NearestMethod",

@@ -81,22 +81,7 @@ class Warp:
     signs: NDArray[np.float64]
 
     @classmethod
-    def of_pair(cls, carriers: Carriers, learned: Carriers) -> "Warp":
-        """Of two carriers. A phase that grows with nearness does so in the network's image too:
-        where a sign asks for it, the image is mirrored."""
-        signs = np.prod([signs_of(one) for one in (carriers, learned)], axis=0)
-        matrix = np.linalg.solve(learned.step_rad, signs[:, None] * carriers.step_rad)
-        return cls(matrix, learned.step_rad, signs)
-
-    @classmethod
-    def of_one(cls, step_rad: NDArray[np.float64], learned_px: float) -> "Warp":
-        """Of one carrier, whose phase changes by ``step_rad`` (2,) per px along x and y, to one that
-        grows downwards with a period of ``learned_px``: the image is turned and scaled."""
-        x, y = step_rad * (learned_px / TAU)
-        return cls(np.array([[y, -x], [x, y]]), np.array([[0.0, TAU / learned_px]]), np.ones(1))
-
-    @classmethod
-    def to_periods(cls, step_rad: NDArray[np.float64], signs: NDArray[np.float64]) -> "Warp":
+    def of(cls, step_rad: NDArray[np.float64], signs: NDArray[np.float64]) -> "Warp":
         """Of the carriers ``step_rad`` (K, 2) and ``signs`` (K,) to what `known` says, no further
         in size than `known_scale`."""
         matrix, turned = to_known(step_rad, signs)

@@ -93,8 +93,9 @@ class Setup:
     def drawn(self) -> list[str]:
         """The axes that the lights which the method learned from disturbed too."""
         recipe = getattr(self.method.weights_config, "recipe", {})
-        held_out = recipe.get("held_out", ())
-        axes = corruptions().axes.items() if recipe.get("lights") else ()
+        if "held_out" not in recipe:
+            return []
+        held_out, axes = recipe["held_out"], corruptions().axes.items()
         return [name for name, axis in axes if axis.drawn and name not in held_out]
 
     def key(self) -> dict[str, Any]:

@@ -9,7 +9,6 @@ can run code. The same tensors and configuration give the same bytes.
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from threading import get_ident
@@ -102,18 +101,10 @@ class ModelConfig(TrainedConfig):
 
 @checked_dataclass(frozen=True, config=_STRICT, kw_only=True)
 class NetConfig(TrainedConfig):
-    """The network of a learned method, and how its answers are used. ``threshold``: logit from
-    which on a pixel is object; ``lead``: what is added to the logit of the base order;
-    ``temperature``, ``offset`` and ``doubted`` as of `learned.Odds`, all chosen on validation
-    views; ``period_px``: image px per fringe period of the training images, by direction; ``steps``
+    """A network of fringe-net. ``threshold``: logit from which on a pixel is object; ``steps``
     trained."""
 
     threshold: Finite
-    period_px: dict[Text, Finite]
-    lead: Finite = 0.0
-    temperature: Finite = 1.0
-    offset: Finite = 0.0
-    doubted: Finite = 1.0
     steps: Count = 0
 
 
@@ -138,26 +129,17 @@ def _depth_network(config: ModelConfig) -> "nn.Module":
     return network
 
 
-def _refiner(kind: str, config: NetConfig) -> "nn.Module":
-    from fpp_ml_bench.baselines.learned import network  # imports this module
+def _fringe_network(config: NetConfig) -> "nn.Module":
+    from fpp_ml_bench.baselines.learned.network import FringeNet  # imports this module
 
-    return getattr(network, kind)(**config.options)  # type: ignore[no-any-return]
+    return FringeNet(**config.options)
 
 
 DEPTH_NETWORKS = Family(
     "fpp-ml-bench", TypeAdapter(ModelConfig), "RECIPE", _depth_network, half=False
 )
-FILTER_NETWORKS = Family(
-    "fpp-ml-bench classical-net",
-    TypeAdapter(NetConfig),
-    "classical-net",
-    partial(_refiner, "DepthFilter"),
-)
 FRINGE_NETWORKS = Family(
-    "fpp-ml-bench fringe-net", TypeAdapter(NetConfig), "fringe-net", partial(_refiner, "FringeNet")
-)
-PHASE_NETWORKS = Family(
-    "fpp-ml-bench phase-net", TypeAdapter(NetConfig), "phase-net", partial(_refiner, "PhaseNet")
+    "fpp-ml-bench fringe-net", TypeAdapter(NetConfig), "fringe-net", _fringe_network
 )
 
 

@@ -201,7 +201,7 @@ fpp-eval predictions --json result.json
 fpp-eval predictions data/mini --split test --target depth_exact --report report
 fpp-eval init predictions
 fpp-eval check predictions
-fpp-eval compare result.json leaderboard/rows/phase-net-vertical.json
+fpp-eval compare result.json leaderboard/rows/fringe-net-crossed.json
 fpp-eval verify result.json predictions data/mini
 fpp-eval schema
 """,

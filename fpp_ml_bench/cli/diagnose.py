@@ -219,7 +219,7 @@ def _reliance_table(title: str, reliance: Reliance) -> Table:
 fpp-bench robustness phase --quick --out robustness                    a look, some minutes
 fpp-bench robustness phase --out robustness                            the test set, resumable axis by axis
 fpp-bench robustness classical --steps 6 --set unseen --axes motion,gloss --out robustness-unseen
-fpp-bench robustness phase-net --out robustness --into leaderboard/rows/phase-net-horizontal.json
+fpp-bench robustness fringe-net --out robustness --into leaderboard/rows/fringe-net-horizontal.json
 fpp-bench robustness unet-global-rmse --size 224 --out robustness-224
 fpp-bench robustness phase --out s3://bucket/robustness --cluster ray://head:10001
 """,

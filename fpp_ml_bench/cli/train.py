@@ -31,11 +31,8 @@ class TrainCommand(MethodCommand):
 @command(
     """\
 fpp-bench train loss/hybrid_l1_0.7 data/small224 --out runs/mine
-fpp-bench train phase-net --out runs/phase-net      the network of the phase route; it renders its own views
-fpp-bench train phase-net --albedo any --out runs/phase-net-any      without brightness
-fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; the same
-fpp-bench train fringe-net --fringes lines --seed 1 --out runs/fringe-net      wrapped phase; the same
-fpp-bench train classical-net --out runs/classical-net      noise and missed pixels of three steps; the same
+fpp-bench train fringe-net --out runs/fringe-net      wrapped phase and mask; it renders its own views
+fpp-bench train fringe-net --seed 1 --minutes 60 --out runs/another      in pieces; the same command goes on
 fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces
 accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs
 fpp-bench predict runs/mine/weights.safetensors data/small224 --out predictions

@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.learned.any_fringes import empty_scene_channel
+from fpp_ml_bench.baselines.learned.fringe_net import empty_scene_channel
 from fpp_ml_bench.baselines.learned.scenes import (
-    VALIDATION_LIGHTS,
     View,
     drawn_light,
     photographed,
@@ -64,6 +63,8 @@ EDGE_POINTS = 2000
 """Pixels of interest that an image holds, as centres of training windows."""
 PAPER_EVERY = 8
 """Every so many settings the rig is the paper's, which most users measure with."""
+VALIDATION_LIGHTS = ("paper", "workshop")
+"""Of the validation objects, one a rig in turn."""
 VALIDATION_VIEWS = 2
 """Views of each validation object in each of its settings."""
 OUTSIDE, OBJECT, NEITHER = 0, 1, 2
