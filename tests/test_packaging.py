@@ -171,7 +171,7 @@ def _without_extras(folder, *words):
     ("words", "library", "extra"),
     [
         (("train", "loss/l1", "DATA", "--out", "run"), "(torch|accelerate)", "train"),
-        (("predict", "phase-net", "DATA", "--out", "predictions"), "torch", "train"),
+        (("predict", "fringe-net", "DATA", "--out", "predictions"), "torch", "train"),
         (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "safetensors", "train"),
         (
             ("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"),

@@ -57,9 +57,9 @@ from fpp_ml_bench.coding.crossed import WINDOW_PERIODS
 from fpp_ml_bench.coding.phase_shift import phase_weights
 from fpp_ml_bench.constants import MM_PER_M
 
-HALF_CONFIDENCE_MM = 5.0
-"""Expected error, in mm, at which the confidence is a half. It scales the confidence and leaves the
-ranking of pixels as it is."""
+HALF_CONFIDENCE_PARTS = 120
+"""Parts of the working range; an expected error as large as one has a confidence of a half, 5 mm of
+the paper's 600. It scales the confidence and leaves the ranking of pixels as it is."""
 SATURATED_SHARE = 0.02
 """Share of a pixel's window that may be clipped. Above it the reason is SATURATED; the depth
 stays."""
@@ -388,7 +388,8 @@ def _judged(
     if window is not None:
         clipped = window.moment(clipped) / np.maximum(fit.weight, 1e-3)
     found, least = depth_mm > 0, settings.min_confidence
-    confidence = np.where(found, 1 / (1 + error_mm / HALF_CONFIDENCE_MM), 0)
+    half_mm = 2 * seen.rig.half_range_mm / HALF_CONFIDENCE_PARTS
+    confidence = np.where(found, 1 / (1 + error_mm / half_mm), 0)
     by_reason = {
         Reason.BACKGROUND: ~seen.inside,
         Reason.LOW_MODULATION: fit.brightness < MIN_MODULATION,

@@ -202,7 +202,6 @@ def test_without_a_mask_background_is_not_in_range(opened):
     [
         ("classical", {"steps": 3, "direction": "vertical"}),
         ("classical", {"steps": 3, "fewest": True}),
-        ("classical-net", {}),
     ],
 )
 def test_beyond_the_end_of_the_range_there_is_no_depth(name, options):
@@ -302,11 +301,8 @@ def test_the_phase_route_takes_the_only_direction_that_a_rig_has():
 def test_methods_by_name(opened):
     assert tuple(methods()) == (
         "classical",
-        "classical-net",
         "phase",
-        "phase-net",
         "crossed",
-        "crossed-net",
         "fringe-net",
         "constant",
         "nearest",

@@ -238,10 +238,10 @@ def test_methods_of_installed_packages(monkeypatch):
 
 def test_a_name_that_is_almost_right():
     with pytest.raises(
-        PredictionError, match=r"unknown method 'phase-nte'; did you mean 'phase-net'\?"
+        PredictionError, match=r"unknown method 'fringe-nte'; did you mean 'fringe-net'\?"
     ):
-        find("phase-nte")
-    with pytest.raises(PredictionError, match="there are classical, classical-net, phase"):
+        find("fringe-nte")
+    with pytest.raises(PredictionError, match="there are classical, phase, crossed, fringe-net"):
         find("something else")
 
 

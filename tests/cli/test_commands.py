@@ -187,14 +187,12 @@ def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatc
         (["predict", "classical", "TINY", "--out", "OUT", "--steps", "2"], "3 to the 18"),
         (["predict", "classical", "TINY", "--out", "OUT", "--threads", "0"], "--threads 0"),
         (["predict", "classical", "TINY", "--out", "TINY"], "already holds"),
-        (["train", "phase-net", "--out", "OUT", "--unions", "-1"], "unions -1"),
-        (["train", "phase-net", "--out", "OUT", "--rate", "nan"], "rate above 0"),
-        (["train", "phase-net", "--out", "OUT", "--albedo", "two"], "--albedo"),
-        (["train", "phase-net", "TINY", "--out", "OUT"], "renders what it learns from"),
+        (["train", "fringe-net", "--out", "OUT", "--unions", "-1"], "unions -1"),
+        (["train", "fringe-net", "--out", "OUT", "--rate", "nan"], "rate above 0"),
+        (["train", "fringe-net", "TINY", "--out", "OUT"], "renders what it learns from"),
         (
             ["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"],
-            "--rate is an option of classical-net, phase-net, crossed-net, fringe-net, not of "
-            "loss/l1",
+            "--rate is an option of fringe-net, not of loss/l1",
         ),
     ],
 )

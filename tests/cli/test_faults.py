@@ -22,7 +22,7 @@ from disks import small_disk
 from scored_dataset import make_dataset
 
 from fpp_ml_bench import files, pool
-from fpp_ml_bench.baselines.learned.recipes import PhaseRecipe
+from fpp_ml_bench.baselines.learned.recipe import FringeRecipe
 from fpp_ml_bench.baselines.learned.training import train_net
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in, save_checkpoint
 from fpp_ml_bench.cli import main, main_eval, run_command
@@ -93,7 +93,7 @@ def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
             TrainingError, match="another process is training in this folder; wait for it"
         ),
     ):
-        train_net(PhaseRecipe(), out)
+        train_net(FringeRecipe(), out)
     assert not out.exists()  # the lock made it, and nothing was written there
 
 

@@ -1,250 +1,157 @@
-"""fringe-net: the truth of its samples, its phases in the image's orientation, an ensemble's
-uncertainty, a small training, and what a perfect network would measure."""
+"""What fringe-net makes of its networks' answers: perfect ones give perfect depth on any rig, an
+ensemble's uncertainty, the object that they call."""
 
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
-import torch
 
-from fpp_ml_bench.baselines.learned import training
-from fpp_ml_bench.baselines.learned.fringe_net import CrossedPhases, FringePhase, phases_of
-from fpp_ml_bench.baselines.learned.fringe_recipe import FringeRecipe, FringeTask
-from fpp_ml_bench.baselines.learned.inputs import Geometry
+from fpp_ml_bench.baselines.learned.fringe_net import Fringes, LinePart, PairPart, phases_of
 from fpp_ml_bench.baselines.learned.method import FringeNetMethod
-from fpp_ml_bench.baselines.learned.network import FringeNet
-from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views, render_views, with_unions
-from fpp_ml_bench.baselines.learned.training import train_net
-from fpp_ml_bench.baselines.phase.geometry import TAU, Carriers, wrapped
+from fpp_ml_bench.baselines.learned.scenes import photographed
+from fpp_ml_bench.baselines.learned.warp import PLACES, signs_of
+from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
 from fpp_ml_bench.baselines.phase.observe import OneCarrier, TwoCarriers
 from fpp_ml_bench.baselines.phase.route import one_carrier, two_carriers
 from fpp_ml_bench.baselines.phase.settings import Settings
-from fpp_ml_bench.errors import NetworkError, PredictionError, RecipeError
-from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS
+from fpp_ml_bench.optics.rig import Rig
 
-LINES, CROSSED = paper_rig(320), crossed_rig(320, "crossed-18")
-GROUPS = [
-    Group("drawn-000", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
-    Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
-]
-SMALL = FringeRecipe(
-    steps=40,
-    batch=2,
-    window=64,
-    warm_up=1,
-    widths=(8, 12),
-    fine=8,
-    validate_every=20,
-    averaged=0.9,
-    unions=0,
-)
-RIGS = {"lines": LINES, "crossed": CROSSED}
+OTHER = crossed_rig(400).with_crossed(Crossed((26.0, 20.0), (100.0, 20.0)))
+RIGS = {
+    "crossed": crossed_rig(320).with_crossed(Crossed((36.0, 36.0), (140.0, 50.0))),
+    "crossed, other": replace(OTHER, translation_m=(-0.125, 0.1, 0.0)),
+    "horizontal": paper_rig(320),
+    "vertical": paper_rig(320),
+}
 
 
-@pytest.fixture(scope="module", params=RIGS)
-def task(request: pytest.FixtureRequest) -> FringeTask:
-    return replace(SMALL, fringes=request.param).task(RIGS[request.param])
+class Perfect:
+    """Stands in for a network: the true phases and object, in the image that it is asked in."""
+
+    def __init__(
+        self, phases: np.ndarray, inside: np.ndarray, scale: float = 0.01, off: float = 0.0
+    ) -> None:
+        self.phases, self.inside, self.scale, self.off = phases, inside, scale, off
+
+    def outputs(self, x: np.ndarray) -> np.ndarray:
+        assert x.shape[1:] == self.inside.shape
+        answer = np.zeros((10, *self.inside.shape), np.float32)
+        for place, phase in zip(PLACES[len(self.phases)], self.phases + self.off, strict=True):
+            answer[place], answer[3 + place] = np.sin(phase), np.cos(phase)
+            answer[6 + place] = np.log(self.scale)
+        answer[9] = np.where(self.inside, 5.0, -5.0)
+        return answer
 
 
-@pytest.fixture(scope="module")
-def views(task: FringeTask, tmp_path_factory: pytest.TempPathFactory) -> list[View]:
-    folder = tmp_path_factory.mktemp("views")
-    render_views(GROUPS, RIGS[task.recipe.fringes], task.frames, folder, 1, False, task.decoded)
-    return list(read_views(folder, GROUPS, "train"))
-
-
-def true_phases(rig, fringes: str, depth_mm: np.ndarray) -> np.ndarray:
+def _true_phases(rig: Rig, fringes: str, depth_mm: np.ndarray) -> np.ndarray:
     """From the exact depth, (K, H, W)."""
-    depth = np.where(depth_mm > 0, depth_mm, 1000.0)
+    depth = np.where(depth_mm > 0, depth_mm, 1800.0)
     if fringes == "crossed":
         carriers = Carriers.of(rig, rig.crossed)
         return carriers.phases(carriers.nearness(depth))
     return OneCarrier(rig, Settings(direction=fringes)).layer.absolute_phase(depth)[None]
 
 
-def test_the_truth_of_a_sample_is_the_phase_of_the_exact_depth(
-    task: FringeTask, views: list[View]
-) -> None:
-    samples = task.samples(views)
-    lines = task.recipe.fringes == "lines"
-    assert [sample.direction for sample in samples] == list(
-        DIRECTIONS if lines else DIRECTIONS[:1]
-    ) * len(views)
-    for sample, view in zip(samples, np.repeat(views, 2 if lines else 1), strict=True):
-        fringes = sample.direction if lines else "crossed"
-        truth = true_phases(RIGS[task.recipe.fringes], fringes, view.depth_mm)[
-            :, *sample.scene.crop
-        ]
-        count = len(truth)
-        numerator, denominator = (
-            sample.missing[:count].astype(np.float64),
-            sample.missing[count:].astype(np.float64),
+def _warped(fringes: Fringes, phases: np.ndarray, inside: np.ndarray) -> Perfect:
+    """What a perfect network would answer in the image that ``fringes`` give it."""
+    warp = fringes.warp
+    if not warp.needed:
+        return Perfect(phases, inside)
+    size, move = warp._frame(inside.shape)
+    affine = np.column_stack([warp.matrix, move])
+
+    def taken(image: np.ndarray) -> np.ndarray:
+        return cv2.warpAffine(
+            image.astype(np.float32), affine, size, borderMode=cv2.BORDER_REPLICATE
         )
-        error = np.abs(wrapped(np.arctan2(numerator, denominator) - truth))[:, sample.target]
-        assert (
-            sample.target.sum() > 1000
-            and np.median(error) < 0.02
-            and np.quantile(error, 0.95) < 0.2
-        )
-        amplitude = np.hypot(numerator, denominator)[:, sample.target]
-        assert 0.4 < np.median(amplitude) < 1.3  # in that of a sinusoid of the surroundings' spread
-        assert not sample.missing[:, ~sample.target].any()
+
+    y, x = np.indices(inside.shape)
+    own_y, own_x = np.indices(size[::-1])
+    answers = []
+    for phase, step, sign in zip(phases, warp.step_rad, warp.signs, strict=True):
+        carrier = np.tensordot(step, np.tensordot(warp.matrix, [x, y], 1) + move[:, None, None], 1)
+        beside = sign * phase - carrier
+        angle = np.arctan2(taken(np.sin(beside)), taken(np.cos(beside)))
+        answers.append(angle + step[0] * own_x + step[1] * own_y)
+    return Perfect(np.stack(answers), taken(inside) > 0.5)
 
 
-def test_windows_show_the_phase_that_is_asked_for(task: FringeTask, views: list[View]) -> None:
-    """The light of a window follows the cosine of the phase that is its truth; one carrier grows
-    downwards."""
-    samples, random = task.samples(views), np.random.default_rng(0)
-    for sample in samples:
-        window = task.draw([sample], random)
-        fitted = window["fitted"]
-        count = len(window["truth"]) // 2
-        assert window["x"].shape == (2, 64, 64) and fitted.sum() > 50
-        expected = window["truth"][count:].sum(axis=0)[fitted]
-        assert np.corrcoef(window["x"][1][fitted], expected)[0, 1] > 0.9
-        if count == 1:
-            phase = np.arctan2(window["truth"][0], window["truth"][1])
-            assert np.median(wrapped(np.diff(phase, axis=0))[fitted[1:] & fitted[:-1]]) > 0.3
-    assert len(task.samples(with_unions(views, 1, 0))) == len(samples) + len(views)
-
-
-class Perfect:
-    """Stands in for a network: the truth, in the orientation that it is asked in."""
-
-    def __init__(self, phases: np.ndarray, scale: float = 0.01, off: float = 0.0) -> None:
-        self.phases, self.scale, self.off = phases, scale, off
-
-    def outputs(self, x: np.ndarray) -> list[np.ndarray]:
-        assert x.shape[1:] == self.phases.shape[1:]
-        phases = self.phases + self.off
-        scales = np.full(phases.shape, np.log(self.scale))
-        return [np.concatenate([np.sin(phases), np.cos(phases), scales]).astype(np.float32)]
-
-
-@pytest.mark.parametrize("fringes", ["horizontal", "vertical", "crossed"])
-def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None:
-    """Where the order is right, the depth of the true phase is the true depth."""
-    rig = CROSSED if fringes == "crossed" else LINES
+@pytest.mark.parametrize("name", RIGS)
+def test_perfect_phases_give_perfect_depth(name: str) -> None:
+    """Where the order is right, the depth of the true phase is the true depth; the object is what
+    the networks call one."""
+    rig, fringes = RIGS[name], name.split(",")[0]
     frame = (
         rig.sequence.crossed_frames[0]
         if fringes == "crossed"
         else rig.sequence.sinusoids(fringes)[0]
     )
-    render_views(GROUPS[1:], rig, (frame,), tmp_path, 1)
-    view = next(read_views(tmp_path, GROUPS, "validation"))
-    truth = true_phases(rig, fringes, view.depth_mm)
-    model = (
-        TwoCarriers(rig) if fringes == "crossed" else OneCarrier(rig, Settings(direction=fringes))
+    images, depth_mm, flags = photographed(
+        Studio(BuildSettings(rig, ("mug",))), "mug", "A0", (frame,)
     )
-    seen = model.observe(view.frames[0])
-    crop = seen.crop
-    cut = truth[:, *crop]
+    target = (depth_mm > 0) & ((flags & VOID) == 0)
+    truth = _true_phases(rig, fringes, depth_mm)
     if fringes == "crossed":
-        part = CrossedPhases.of(model.carriers, model.carriers, [Perfect(cut)])
-        route, measured = (
-            two_carriers(model, phases=part.before, learned=part.after),
-            two_carriers(model),
-        )
+        model = TwoCarriers(rig)
+        carriers = model.carriers
+        step_rad, signs = carriers.step_rad, signs_of(carriers)
     else:
-        rotation = Geometry(model).rotation
-        perfect = Perfect(rotation.turn(cut) * rotation.sign)
-        part = FringePhase.of(Geometry(model), [perfect], model.period_px)
-        route, measured = one_carrier(model, learned=part), one_carrier(model)
-    found = part.phases(seen)
-    assert np.abs(wrapped(found.phase_rad - truth[:, *crop])).max() < 1e-3
-    assert found.sigma_rad == pytest.approx(0.01 * np.sqrt(2), rel=1e-4)
-    answer, before = route.measure(view.frames[0]), measured.measure(view.frames[0])
-    both = (answer.depth_mm > 0) & (before.depth_mm > 0) & view.target
-    errors = [np.abs(one.depth_mm - view.depth_mm)[both] for one in (answer, before)]
-    assert both.sum() > 0.9 * view.target.sum()
-    assert np.median(errors[0]) < 0.05 < np.median(errors[1])
-    assert np.quantile(answer.sigma_mm[both], 0.5) < np.quantile(before.sigma_mm[both], 0.5)
-    if fringes != "crossed":  # the order is that of the local fit
-        absolute = [one.wrapped_phase_rad + TAU * one.order for one in (answer, before)]
-        assert np.nanmax(np.abs(absolute[0] - absolute[1])) < np.pi + 1e-3
+        model = OneCarrier(rig, Settings(direction=fringes))
+        phase = model.layer.absolute_phase(1800.0)
+        step_rad = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)]])
+        signs = np.array([np.sign(np.median(model.layer.gain))])
+    seen = model.observe(images[0])
+    inside = depth_mm > 0
+    empty = Fringes.of(step_rad, signs, [])
+    network = _warped(empty, truth[:, *seen.crop], inside[seen.crop])
+    both = Fringes.of(step_rad, signs, [network])  # type: ignore[list-item]
+    assert both.warp.needed == (name != "crossed")
+    if fringes == "crossed":
+        route = two_carriers(model, PairPart(both).before, PairPart.after)
+        measured = two_carriers(model)
+    else:
+        route = one_carrier(model, LinePart(both).before, LinePart.after)
+        measured = one_carrier(model)
+    answer, before = route.measure(images[0]), measured.measure(images[0])
+    shared = (answer.depth_mm > 0) & (before.depth_mm > 0) & target
+    errors = [np.abs(one.depth_mm - depth_mm)[shared] for one in (answer, before)]
+    assert shared.sum() > 0.9 * target.sum()
+    assert np.median(errors[0]) < 0.3 * np.median(errors[1])
+    assert np.quantile(answer.sigma_mm[shared], 0.5) < np.quantile(before.sigma_mm[shared], 0.5)
+    assert (answer.depth_mm > 0)[~inside].mean() < 1e-3
+    assert (answer.depth_mm > 0)[target].mean() > 0.95
 
 
 def test_an_ensemble_states_how_far_its_members_are_apart() -> None:
-    x, phases = np.zeros((2, 8, 8), np.float32), np.linspace(-3, 3, 64).reshape(1, 8, 8)
-    alone, _ = phases_of([Perfect(phases, 0.02)], x)  # type: ignore[list-item]
-    assert alone.sigma_rad == pytest.approx(0.02 * np.sqrt(2), rel=1e-4)
-    members = [Perfect(phases, 0.02, off) for off in (-0.3, 0.0, 0.3)]
-    three, _ = phases_of(members, x)  # type: ignore[arg-type]
-    assert np.abs(wrapped(three.phase_rad - phases)).max() < 1e-5
-    assert three.sigma_rad == pytest.approx(np.hypot(0.02 * np.sqrt(2), 0.3), rel=1e-3)
+    x, phases = np.zeros((4, 8, 8), np.float32), np.linspace(-3, 3, 64).reshape(1, 8, 8)
+    inside = np.arange(64).reshape(8, 8) % 2 == 0
+    alone, logit = phases_of([Perfect(phases, inside, 0.02)], x)  # type: ignore[list-item]
+    assert alone.sigma_rad[0] == pytest.approx(0.02 * np.sqrt(2), rel=1e-4)
+    assert np.array_equal(logit > 0, inside)
+    members = [Perfect(phases, inside, 0.02, off) for off in (-0.3, 0.0, 0.3)]
+    members[0].inside = ~inside
+    three, logit = phases_of(members, x)  # type: ignore[arg-type]
+    assert np.abs(wrapped(three.phase_rad[0] - phases[0])).max() < 1e-5
+    assert three.sigma_rad[0] == pytest.approx(np.hypot(0.02 * np.sqrt(2), 0.3), rel=1e-3)
+    assert np.array_equal(logit > 0, inside)  # two of three
 
 
-def test_a_training_in_small_is_resumed_and_predicts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
-    out = tmp_path / "run"
-    first = train_net(SMALL, out, rig=LINES, minutes=1e-9)
-    assert first.weights is None and first.steps == 20
-    trained = train_net(SMALL, out, rig=LINES)
-    assert trained.weights == out / "fringe-net-lines-42.safetensors"
-    log = [
-        float(line.split('"loss_phase": ')[1].split(",")[0])
-        for line in (out / "log.jsonl").read_text().splitlines()
-    ]
-    assert log[1] < 0.7 * log[0]
-    assert 0 < trained.validation["interior_rad"] < 1.5
-    view = next(read_views(out / "views", GROUPS, "validation"))
-    frames: list[np.ndarray | None] = [None] * len(LINES.sequence)
-    for number, direction in enumerate(DIRECTIONS):
-        frames[LINES.sequence.sinusoids(direction)[0]] = view.frames[number].astype(np.uint8)
-        method = FringeNetMethod.for_rig(LINES, fringes=direction, weights=trained.weights)
-        answer = method.answer(frames)
-        assert answer.sigma_mm is not None and np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
-        assert (
-            method.settings["fringes"] == direction
-            and f"one {direction} frame by one network" in method.title
-        )
-        submission = SimpleNamespace(settings=method.settings, name=method.title)
-        assert FringeNetMethod.short_name(submission) == f"fringe-net, 1 {direction}"  # type: ignore[arg-type]
-    with pytest.raises(
-        PredictionError, match="learned from horizontal, vertical fringes only, not from crossed"
-    ):
-        FringeNetMethod.for_rig(CROSSED, weights=trained.weights)
-    with pytest.raises(PredictionError, match="projects no crossed frame"):
-        FringeNetMethod.for_rig(LINES, fringes="crossed", weights=trained.weights)
-    with pytest.raises(PredictionError, match="expected 1 to 3"):
-        FringeNetMethod.for_rig(LINES, members=4)
-
-
-def test_crossed_fringes_that_were_not_learned_are_warped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
-    recipe = replace(SMALL, fringes="crossed", steps=1, validate_every=1)
-    trained = train_net(recipe, tmp_path / "run", rig=CROSSED)
-    assert trained.weights is not None
-    method = FringeNetMethod.for_rig(CROSSED, weights=trained.weights)
-    assert (
-        method.frames_used == CROSSED.sequence.crossed_frames[:1]
-        and method.settings["fringes"] == "crossed"
-    )
-    other = crossed_rig(480, "crossed-12")
-    warped = FringeNetMethod.for_rig(other, weights=trained.weights)
-    image = np.random.default_rng(0).integers(0, 256, (480, 480)).astype(np.uint8)
-    frames = [image if number == 0 else None for number in range(len(other.sequence))]
-    assert warped.answer(frames).depth.shape == (480, 480)
-
-
-def test_networks_and_recipes_that_are_refused() -> None:
-    network = FringeNet(2, (8, 12), 8)
-    assert network(torch.zeros(1, 2, 8, 12))[0].shape == (1, 6, 8, 12)
-    assert FringeNet(**network.options).options == network.options
-    assert sum(parameter.numel() for parameter in FringeRecipe().network().parameters()) < 1_000_000
-    with pytest.raises(NetworkError, match="1 to 3 carriers"):
-        FringeNet(4)
-    with pytest.raises(NetworkError, match="multiples of 4"):
-        network(torch.zeros(1, 2, 6, 8))
-    with pytest.raises(RecipeError, match="lines or crossed"):
-        FringeRecipe(fringes="diagonal")  # type: ignore[arg-type]
-    with pytest.raises(RecipeError, match="this one has none"):
-        replace(SMALL, fringes="crossed").task(LINES)
+def test_the_shipped_networks_answer_for_any_rig() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (300, 400)).astype(np.uint8)
+    rig = replace(RIGS["crossed, other"], camera=replace(OTHER.camera, height=300, cy=150.0))
+    frames = [image if number == 0 else None for number in range(len(rig.sequence))]
+    method = FringeNetMethod.for_rig(rig)
+    assert method.settings["fringes"] == "crossed" and method.frames_used == (0,)
+    answer = method.answer(frames)
+    assert answer.depth.shape == (300, 400) and np.isfinite(answer.depth).all()
+    pair = FringeNetMethod.for_rig(paper_rig(224), fringes="crossed")
+    assert pair.frames_used == (0, 18)  # whose mean is a crossed frame
+    with pytest.raises(PredictionError, match="expected 1 to"):
+        FringeNetMethod.for_rig(rig, members=9)

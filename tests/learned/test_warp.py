@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.learned.warp import Warp
+from fpp_ml_bench.baselines.learned.warp import KNOWN_PX, Warp, signs_of
 from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import TAU
@@ -23,7 +23,7 @@ def mirrored(rig: Rig) -> Rig:
 
 OTHERS = {
     "smaller": crossed_rig(640),
-    "larger": crossed_rig(1280),
+    "larger": crossed_rig(1920),
     "other angles": crossed_rig(960).with_crossed(Crossed((14.0, 10.0), (100.0, 20.0))),
     "other signs": mirrored(crossed_rig(800)),
 }
@@ -35,16 +35,14 @@ def test_both_carriers_come_to_those_that_were_learned(name: str) -> None:
     and phases measured there come back as those of the image."""
     rig = OTHERS[name]
     carriers, learned = (Carriers.of(one, one.crossed) for one in (rig, LEARNED))
-    warp = Warp.of_pair(carriers, learned)
+    warp = Warp.of(carriers.step_rad, signs_of(carriers))
     assert warp.needed
     y, x = np.mgrid[:90, :120]
     phases = carriers.step_rad[:, :1, None] * x + carriers.step_rad[:, 1:, None] * y
     phases += np.array([0.3, -1.1])[:, None, None]
     image = warp.image((100 + 40 * np.cos(phases).sum(axis=0)).astype(np.float32))
     own_y, own_x = np.mgrid[: image.shape[0], : image.shape[1]]
-    waves = [
-        np.exp(1j * (along_x * own_x + along_y * own_y)) for along_x, along_y in learned.step_rad
-    ]
+    waves = [np.exp(1j * (along_x * own_x + along_y * own_y)) for along_x, along_y in warp.step_rad]
     place = np.linalg.inv(warp.matrix) @ (
         np.stack([own_x, own_y]).reshape(2, -1) + warp._frame((90, 120))[1][:, None] * -1
     )
@@ -69,23 +67,25 @@ def test_both_carriers_come_to_those_that_were_learned(name: str) -> None:
     assert (gains[0] * warp.signs == gains[1]).all()
 
 
-def test_the_rig_of_the_weights_is_left_as_it_is() -> None:
+def test_the_known_rig_is_left_as_it_is() -> None:
     carriers = Carriers.of(LEARNED, LEARNED.crossed)
-    assert not Warp.of_pair(carriers, carriers).needed
-    assert not Warp.of_one(np.array([0.002, TAU / 22.5]), 22.56).needed
+    assert not Warp.of(carriers.step_rad, signs_of(carriers)).needed
+    assert not Warp.of(np.array([[0.002, TAU / 18.1]]), np.ones(1)).needed
 
 
-def test_one_carrier_is_turned_and_scaled_to_grow_downwards() -> None:
+@pytest.mark.parametrize("sign", [1, -1])
+def test_one_carrier_is_turned_and_scaled_to_grow_downwards(sign: int) -> None:
     step_rad = TAU / 9 * np.array([np.sin(0.4), np.cos(0.4)])
-    warp = Warp.of_one(step_rad, 18.0)
+    warp = Warp.of(sign * step_rad[None], np.array([sign]))
     y, x = np.mgrid[:60, :80]
     phase = step_rad[0] * x + step_rad[1] * y
     place = np.tensordot(warp.matrix, np.stack([x, y]), axes=1)
-    assert np.abs(place[1] * TAU / 18 - phase).max() < 1e-9
-    assert np.linalg.det(warp.matrix) == pytest.approx(4)  # twice as large, not mirrored
+    period_px = warp.period_px
+    assert 0.7 * KNOWN_PX[1] < period_px < 1.6 * KNOWN_PX[1]
+    assert np.abs(place[1] * TAU / period_px - phase).max() < 1e-9
+    assert np.linalg.det(warp.matrix) == pytest.approx((period_px / 9) ** 2)  # not mirrored
     image = warp.image((100 + 50 * np.cos(phase)).astype(np.float32))
-    assert image.shape[0] > 120
-    down = TAU / 18 * np.arange(image.shape[0])[:, None] + np.zeros(image.shape)
-    offset = warp._frame((60, 80))[1][1] * TAU / 18
+    down = TAU / period_px * np.arange(image.shape[0])[:, None] + np.zeros(image.shape)
+    offset = warp._frame((60, 80))[1][1] * TAU / period_px
     (back,) = warp.back(wrapped(down - offset)[None].astype(np.float32), [], (60, 80))
-    assert np.abs(wrapped(back[0] - phase)).max() < 1e-3
+    assert np.abs(wrapped(sign * back[0] - phase)).max() < 1e-3

@@ -187,7 +187,7 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
         (["no-such.safetensors"], "expected a weights file (*.safetensors), found nothing"),
         (
             ["{w}/raw.safetensors", "--steps", "4"],
-            "--steps is an option of classical, classical-net, not of",
+            "--steps is an option of classical, not of",
         ),
         (
             ["classical", "--device", "cpu"],

@@ -9,10 +9,6 @@ import pytest
 from crossed_scenes import frame, route, slab
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.learned.inputs import CrossedScene
-from fpp_ml_bench.baselines.learned.odds import Answers
-from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe
-from fpp_ml_bench.baselines.learned.routes import CrossedNetPart
 from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask, observe
 from fpp_ml_bench.baselines.phase.depth import Reason
 from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
@@ -123,30 +119,6 @@ def test_the_wall_is_seen_through_narrow_gaps(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(object_mask, "GAP_OBJECT", np.inf)
     closed, missed_before = filled()
     assert closed > 0.4 and seen < 0.7 * closed and missed < missed_before + allowed
-
-
-def test_a_network_in_doubt_does_not_fill_what_shows_the_wall() -> None:
-    bars = INSIDE & (X % 24 >= 10)
-    measured = route(CUT, FAMILY)
-    part = CrossedNetPart(
-        measured.model.carriers, CrossedRecipe(widths=(4, 4)).network(), threshold=-1.5, lead=0.0
-    )
-    fitted = measured.choose(
-        measured.observe(frame(np.where(bars, DEPTH_MM, 0.0), CUT, FAMILY), None)
-    )
-    scene = CrossedScene.of(fitted)
-    shape = scene.light.shape
-    logits = np.where(scene.exists, np.array([0, 9, 0])[:, None, None], -np.inf)
-
-    def answered(object_logit: float) -> tuple[float, float]:
-        answers = Answers(
-            logits, np.full(shape, object_logit), np.zeros(shape), np.full(shape, 0.1)
-        )
-        found = measured.depth(part.answered(fitted, scene, answers)).depth_mm > 0
-        return float(found[INSIDE & ~bars].mean()), float((~found[bars]).mean())
-
-    (doubted, missed), (believed, _) = answered(0.0), answered(3.0)
-    assert believed > 0.9 and doubted < 0.6 and missed < 1e-3
 
 
 def test_a_pixel_that_the_wall_explains_too_is_answered_and_said_to_be_in_doubt() -> None:

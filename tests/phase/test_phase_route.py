@@ -307,17 +307,16 @@ def test_the_users_word_from_the_command_line(
     dataset = str(tmp_path / "set")
     build(Path(dataset), BuildSettings(RIG, ("cork",), stored="single_shot"), workers=1)
     word = ["--white-grey", "180", "--ambient-grey", "0"]
-    for method in ("phase", "phase-net"):
-        out = tmp_path / method
-        assert main(["predict", method, dataset, "--out", str(out), "--split", "all", *word]) == 0
-        settings = read_submission(out).settings
-        assert (settings["white_grey"], settings["ambient_grey"]) == (180.0, 0.0)
+    out = tmp_path / "phase"
+    assert main(["predict", "phase", dataset, "--out", str(out), "--split", "all", *word]) == 0
+    settings = read_submission(out).settings
+    assert (settings["white_grey"], settings["ambient_grey"]) == (180.0, 0.0)
     for arguments, message in (
         (["phase", dataset, "--white-grey", "-1"], "white_grey -1.0: expected more than 0"),
-        (["phase-net", dataset, "--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
+        (["phase", dataset, "--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
         (
             ["classical", dataset, "--ambient-grey", "6"],
-            "--ambient-grey is an option of phase, phase-net, not of classical",
+            "--ambient-grey is an option of phase, not of classical",
         ),
     ):
         capsys.readouterr()

@@ -411,7 +411,7 @@ def test_the_scenes_show_the_fringes_that_an_option_asks_for(tmp_path):
         (["constant", "--at", "nowhere"], "at 'nowhere': expected standoff"),
         (
             ["constant", "--steps", "3"],
-            "--steps is an option of classical, classical-net, not of constant",
+            "--steps is an option of classical, not of constant",
         ),
         (["constant", "--quick", "--into", "x.json"], "--into: needs all axes"),
     ],

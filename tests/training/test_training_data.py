@@ -12,12 +12,12 @@ from safetensors.torch import load_file, save_file
 from scored_dataset import name_benchmarks
 from tiny_network import config_of, tiny_network
 
-from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
+from fpp_ml_bench.baselines.learned.network import FringeNet, load_net
 from fpp_ml_bench.baselines.training import weights as training_data
 from fpp_ml_bench.baselines.training.depth_training import model_config
 from fpp_ml_bench.baselines.training.recipe import load_recipe
 from fpp_ml_bench.baselines.training.weights import (
-    PHASE_NETWORKS,
+    FRINGE_NETWORKS,
     SHIPPED,
     NetConfig,
     TrainingBenchmark,
@@ -31,14 +31,7 @@ from fpp_ml_bench.loaders.storage import benchmark
 from fpp_ml_bench.loaders.storage.benchmark import Benchmark
 
 OLD = "a" * 64
-NET_OPTIONS = {
-    "widths": [4, 6],
-    "fine": 4,
-    "squeezed": 6,
-    "order_widths": [4, 6],
-    "bound_rad": 1.0,
-    "uncertain": True,
-}
+NET_OPTIONS = {"widths": [8, 12], "fine": 8}
 
 
 @pytest.fixture
@@ -50,19 +43,17 @@ def benchmarks(monkeypatch, opened, tmp_path):
     return named
 
 
-def save_phase_net(path, **changes):
+def save_fringe_net(path, **changes):
     content = {
-        "name": "phase-net",
+        "name": "mine",
         "title": "Small",
         "options": NET_OPTIONS,
         "threshold": -1.0,
-        "period_px": {"horizontal": 5.6},
         "dataset_fingerprint": "0" * 64,
-        "recipe": {"albedo": "one"},
+        "recipe": {},
     }
-    save_weights(
-        path, PhaseNet(**NET_OPTIONS), NetConfig(**{**content, **changes}), family=PHASE_NETWORKS
-    )
+    config = NetConfig(**{**content, **changes})
+    save_weights(path, FringeNet(**NET_OPTIONS), config, family=FRINGE_NETWORKS)
 
 
 def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
@@ -75,7 +66,7 @@ def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
         path = tmp_path / "net.safetensors"
         save_weights(path, network, config)
         assert open_weights(path).config.benchmark == expected
-        save_phase_net(path, benchmark=training_benchmark(data.content))
+        save_fringe_net(path, benchmark=training_benchmark(data.content))
         assert load_net(path).config.benchmark == expected
 
 
@@ -85,9 +76,9 @@ def test_a_file_without_the_entry_is_read(tmp_path):
         open_weights(SHIPPED / f"{name}.safetensors").config.benchmark for name in shipped_names()
     }
     assert named == {TrainingBenchmark("fpp-bench-full-224", 2)}
-    assert load_net().config.benchmark == TrainingBenchmark("phase-net views", 1)
+    assert load_net("fringe-net-42").config.benchmark == TrainingBenchmark("fringe-net views", 1)
     path = tmp_path / "net.safetensors"
-    save_phase_net(path, benchmark=TrainingBenchmark("tiny", 1))
+    save_fringe_net(path, benchmark=TrainingBenchmark("tiny", 1))
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
     config = json.loads(metadata["config"])
@@ -144,7 +135,8 @@ def test_nothing_is_said_on_data_of_the_users_own(opened):
 
 
 @pytest.mark.parametrize(
-    ("command", "method"), [("predict", "network"), ("time", "phase-net"), ("predict", "classical")]
+    ("command", "method"),
+    [("predict", "network"), ("time", "fringe-net"), ("predict", "classical")],
 )
 def test_the_commands_warn_once_and_go_on(
     benchmarks, opened, tiny, tmp_path, capsys, command, method
@@ -164,19 +156,14 @@ def test_the_commands_warn_once_and_go_on(
         )
         save_weights(tmp_path / "mine.safetensors", tiny_network(), config)
         method = tmp_path / "mine.safetensors"
-    if method == "phase-net":
-        period_px = opened.rig.image_px_per_period("horizontal")
-        save_phase_net(
-            tmp_path / "net.safetensors",
-            period_px={"horizontal": period_px},
-            dataset_fingerprint=OLD,
-        )
+    if method == "fringe-net":
+        save_fringe_net(tmp_path / "net.safetensors", dataset_fingerprint=OLD)
         options += ["--weights", tmp_path / "net.safetensors"]
     assert fpp_bench(*[str(argument) for argument in (command, method, tiny, *options)]) == 0
     warnings = [
         line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")
     ]
-    name = {"classical": None, "phase-net": "phase-net"}.get(str(method), "mine")
+    name = None if method == "classical" else "mine"
     expected = (
         "was trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on "
         "tiny version 1"

@@ -1,5 +1,4 @@
-"""The views that the phase networks learn from: drawn lights, splits that stay apart, unions of
-objects."""
+"""The views that fringe-net learns from: drawn lights, and unions of objects."""
 
 import numpy as np
 
@@ -7,7 +6,6 @@ from fpp_ml_bench.baselines.learned.scenes import (
     View,
     companions,
     drawn_light,
-    groups_of,
     united,
     with_unions,
 )
@@ -22,34 +20,6 @@ def test_drawn_lights_differ_and_repeat() -> None:
     assert any(light.bounces.shadows for light in lights) and any(
         light.projector.response != 1 for light in lights
     )
-
-
-def test_groups_keep_the_splits_apart() -> None:
-    groups = groups_of(lights=3, views_a_light=4, seed=0)
-    splits = "train", "validation"
-    shown = {
-        split: {name for g in groups if g.split == split for name, _ in g.views} for split in splits
-    }
-    assert len(shown["train"]) == 40 and len(shown["validation"]) == 5
-    assert not shown["train"] & shown["validation"]
-    assert all(
-        len({name for name, _ in g.views}) == 4 for g in groups if g.name.startswith("drawn")
-    )
-
-
-def test_most_lights_show_one_material_where_that_is_asked_for() -> None:
-    groups = groups_of(lights=6, views_a_light=4, seed=0, textured_every=3, validation_lights=3)
-    drawn = [group.light.surface for group in groups if group.name.startswith(("plain", "drawn"))]
-    assert [(surface.textures, surface.gloss) == ("none", 0) for surface in drawn[:2]] == [
-        True,
-        True,
-    ]
-    assert len(drawn) == 6 and sum(group.name.startswith("drawn") for group in groups) == 2
-    every = groups_of(lights=6, views_a_light=4, seed=0)
-    assert drawn[2] == every[3].light.surface and [group.views for group in every[:7]] == [
-        g.views for g in groups[:7]
-    ]
-    assert sum(group.split == "validation" for group in groups) == 5
 
 
 def test_unions_follow_their_group() -> None:

@@ -1,15 +1,15 @@
 """Training on drawn rigs: what an image and a window show, and a small training."""
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from fpp_ml_bench.baselines.learned import rig_recipe
-from fpp_ml_bench.baselines.learned.network import FringeNet
-from fpp_ml_bench.baselines.learned.rig_recipe import RigRecipe
-from fpp_ml_bench.baselines.learned.rig_views import (
+from fpp_ml_bench.baselines.learned import recipe
+from fpp_ml_bench.baselines.learned.images import (
     OBJECT,
     FringeImage,
     Setting,
@@ -17,20 +17,24 @@ from fpp_ml_bench.baselines.learned.rig_views import (
     render_settings,
     settings_of,
 )
+from fpp_ml_bench.baselines.learned.method import FringeNetMethod
+from fpp_ml_bench.baselines.learned.network import FringeNet
+from fpp_ml_bench.baselines.learned.recipe import FringeRecipe
 from fpp_ml_bench.baselines.learned.training import train_net
 from fpp_ml_bench.baselines.learned.warp import Warp, known, to_known
 from fpp_ml_bench.baselines.phase.geometry import wrapped
 from fpp_ml_bench.constants import TAU, split_of
-from fpp_ml_bench.errors import NetworkError, TrainingError
+from fpp_ml_bench.errors import NetworkError, RecipeError, TrainingError
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 RIG, LIGHT = crossed_rig(320, "crossed-18"), named_light("paper")
 SETTINGS = [
     Setting("train-000", RIG, LIGHT, (("wood_block", "A0"), ("duct_tape", "A60"))),
     Setting("validation-00", RIG, LIGHT, (("mug", "A0"),), "validation"),
 ]
-SMALL = RigRecipe(
+SMALL = FringeRecipe(
     steps=30,
     batch=2,
     window=64,
@@ -67,10 +71,10 @@ def test_images_hold_object_and_surroundings_of_all_fringes(images: list[FringeI
 
 
 def test_windows_show_the_phases_that_are_asked_for(images: list[FringeImage]) -> None:
-    task, random = SMALL.task(RIG), np.random.default_rng(0)
+    random = np.random.default_rng(0)
     seen = set()
     for _ in range(60):
-        window = task.draw(images, random)
+        window = SMALL.draw(images, random)
         places = tuple(np.flatnonzero(window["fitted"].any(axis=(1, 2))))
         fitted = window["fitted"].any(axis=0)
         assert window["x"].shape == (4, 64, 64) and not (fitted & ~window["mask_valid"]).any()
@@ -96,7 +100,7 @@ def test_any_carriers_come_to_those_that_are_known() -> None:
     matrix, _ = to_known(step_rad, np.ones(1))
     assert known(1)[0] @ matrix == pytest.approx(step_rad)
     for period_px, seen_px in ((15.0, 15.0), (20.0, 20.0), (60.0, 20.9), (5.0, 11.6)):
-        warp = Warp.to_periods(steps * (15.0 / period_px), signs)
+        warp = Warp.of(steps * (15.0 / period_px), signs)
         assert warp.period_px == pytest.approx(seen_px, rel=0.01)
         assert warp.needed == (period_px != seen_px)
 
@@ -110,8 +114,10 @@ def test_settings_are_drawn_again_the_same_and_of_their_split() -> None:
 
 
 @pytest.mark.long
-def test_a_training_in_small_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rig_recipe, "settings_of", lambda *args: SETTINGS)
+def test_a_training_in_small_is_resumed_and_predicts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recipe, "settings_of", lambda *args: SETTINGS)
     out = tmp_path / "run"
     stopped = train_net(SMALL, out, minutes=1e-9)
     assert stopped.weights is None and stopped.steps == 15
@@ -119,16 +125,41 @@ def test_a_training_in_small_is_resumed(tmp_path: Path, monkeypatch: pytest.Monk
     assert trained.weights == out / "fringe-net-42.safetensors"
     assert 0 < trained.validation["crossed_interior_rad"] < 2
     assert {"line_edge_rad", "missed_percent", "invented_percent"} <= trained.validation.keys()
+    losses = [
+        json.loads(line)["loss_phase"] for line in (out / "log.jsonl").read_text().splitlines()
+    ]
+    assert losses[1] < 0.9 * losses[0]
+    assert train_net(SMALL, out) == trained
+    view = next(read_images(SETTINGS, out / "views", "validation"))
+    assert view.fringes == "crossed"
+    for fringes in ("crossed", *DIRECTIONS):
+        method = FringeNetMethod.for_rig(RIG, fringes=fringes, weights=trained.weights)
+        image = np.random.default_rng(0).integers(0, 256, (320, 320)).astype(np.uint8)
+        answer = method.answer([image] * len(RIG.sequence))
+        assert answer.sigma_mm is not None and np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
+        assert f"one {fringes} frame by one network" in method.title.replace(" of 18 px", "")
+        submission = SimpleNamespace(settings=method.settings, name=method.title)
+        assert FringeNetMethod.short_name(submission).startswith(f"fringe-net, 1 {fringes}")
     file = next((out / "views").glob("train-000*"))
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(TrainingError, match="delete it"):
         list(read_images(SETTINGS, out / "views", "train"))
 
 
-def test_the_network_has_a_mask_and_three_carriers() -> None:
-    network = RigRecipe().network()
-    assert network(torch.zeros(1, 4, 32, 48))[0].shape == (1, 10, 32, 48)
+def test_networks_and_recipes_that_are_refused() -> None:
+    network = FringeRecipe().network()
+    assert network(torch.zeros(1, 4, 32, 48)).shape == (1, 10, 32, 48)
     assert FringeNet(**network.options).options == network.options
     assert sum(parameter.numel() for parameter in network.parameters()) < 1_000_000
-    with pytest.raises(NetworkError, match="1 to 3 carriers"):
-        FringeNet(4, mask=True)
+    with pytest.raises(NetworkError, match="positive widths"):
+        FringeNet((8, 0))
+    with pytest.raises(NetworkError, match="multiples of 16"):
+        network(torch.zeros(1, 4, 30, 48))
+    for values, said in (
+        ({"steps": 0}, "steps 0: expected 1"),
+        ({"unions": 101}, "unions 101: expected 0 to 100"),
+        ({"views_a_rig": 41}, "views_a_rig 41: expected 1 to 40"),
+        ({"rate": float("nan")}, "rate above 0"),
+    ):
+        with pytest.raises(RecipeError, match=said):
+            FringeRecipe(**values)
