@@ -17,7 +17,6 @@ count nowhere.
 import argparse
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -105,15 +104,11 @@ def measured(
     kind: str,
     dataset: DatasetFolder,
     samples: list[str],
-    threshold: float | None,
     **options: Any,
 ) -> dict[str, Any]:
     """What a method makes of ``samples`` under a kind of disturbance, means over them; ``pixels``:
     by what they are."""
     method = load_method(name, dataset, **options)
-    if threshold is not None:
-        learned = replace(method.route.learned, threshold=threshold)
-        method.route = replace(method.route, learned=learned)
     rows, parts = [], []
     for number, sample in enumerate(samples):
         exact = dataset.target_mm(sample, DEPTH_EXACT)
@@ -184,7 +179,6 @@ def main() -> None:
     parser.add_argument("--only", choices=list(KINDS))
     parser.add_argument("--frames", type=int, default=1, help="of crossed")
     parser.add_argument("--min-confidence", type=float, default=0.0)
-    parser.add_argument("--threshold", type=float, help="of crossed-net's mask")
     given = parser.parse_args()
     dataset = DatasetFolder(given.dataset)
     options: dict[str, Any] = {"min_confidence": given.min_confidence}
@@ -196,7 +190,7 @@ def main() -> None:
     rows = []
     parts = None
     for kind in [given.only] if given.only else KINDS:
-        found = measured(given.method, kind, dataset, samples, given.threshold, **options)
+        found = measured(given.method, kind, dataset, samples, **options)
         parts = parts or found["parts"]
         rows.append(
             {

@@ -1,6 +1,6 @@
 """How exact the wrapped phase of one fringe is, by method, beside what others would use.
 
-    python benchmarks/fringe_phase.py DATASET [--split validation] [--views 3] [--fringes horizontal] [--members 3]
+    python benchmarks/fringe_phase.py DATASET [--split validation] [--views 3] [--fringes horizontal] [--members N]
 
 DATASET: 960 px, of any light; with crossed fringes (``--rig crossed``) for ``--fringes crossed``,
 where the two phases are those of the carriers. Printed for each method: the mean absolute error in
@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from fpp_ml_bench.api import load_method
-from fpp_ml_bench.baselines.learned.fringe_net import FringePhase
-from fpp_ml_bench.baselines.learned.method import FringeNetMethod
+from fpp_ml_bench.baselines.learned.method import MEMBERS, FringeNetMethod
 from fpp_ml_bench.baselines.phase.geometry import TAU, wrapped
 from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Observation
 from fpp_ml_bench.constants import MM_PER_M
@@ -76,10 +75,8 @@ def windowed_fourier(grey: NDArray, step_rad: NDArray, noise_grey: float) -> NDA
 
 def learned_phases(method: FringeNetMethod, seen: Observation | CrossedObservation) -> NDArray:
     """What the networks say of an observation, (K, h, w) rad."""
-    route = method.route
-    if isinstance(route.learned, FringePhase):
-        return route.learned.phases(seen).phase_rad
-    return route.phases(seen).phase_rad  # the observation with the phases of both carriers
+    found = method.route.phases(seen)
+    return found.other_phase[0][None] if isinstance(found, Observation) else found.phase_rad
 
 
 def phases(
@@ -138,7 +135,7 @@ def main() -> int:
         "--fringes", choices=("horizontal", "vertical", "crossed"), default="horizontal"
     )
     parser.add_argument(
-        "--members", type=int, default=3, help="of fringe-net, 0 for without (default: 3)"
+        "--members", type=int, default=MEMBERS, help="of fringe-net, 0 for without (default: all)"
     )
     parser.add_argument(
         "--weights", action="append", default=[], help="of one network of fringe-net, another line"

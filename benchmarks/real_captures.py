@@ -23,12 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned.method import (
-    ClassicalNetMethod,
-    CrossedNetMethod,
-    FringeNetMethod,
-)
-from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.learned.method import FringeNetMethod
 from fpp_ml_bench.baselines.phase.geometry import wrapped
 from fpp_ml_bench.baselines.phase.method import CrossedMethod, PhaseMethod
 from fpp_ml_bench.baselines.robustness.axes import corruptions
@@ -107,14 +102,6 @@ def main() -> int:
                     args.captures / name, rig, theirs.camera, cloud, f"{name}, calibration: {who}"
                 )
         skull = rig_of(theirs, "skull_2x3", Path(scratch))
-        decode(
-            args.captures / "skull_2x3",
-            skull,
-            theirs.camera,
-            cloud,
-            "skull_2x3, classical-net",
-            ClassicalNetMethod(skull),
-        )
         twin(args.captures / "skull_2x3", skull, Path(scratch))
         skull = rig_of(ours, "skull_2x3", Path(scratch))
         phase_of_one_sinusoid(args.captures / "skull_2x3", skull)
@@ -227,13 +214,12 @@ def decode(
     camera: "Pinhole",
     cloud: NDArray,
     title: str,
-    method: Method | None = None,
 ) -> None:
-    """Decode a capture (by ``method``) and compare with the authors' cloud, which lies on the
+    """Decode a capture and compare with the authors' cloud, which lies on the
     undistorted grid of their ``camera``: in depth, and as points after a rigid motion, since
     another principal point turns the camera's frame."""
     frames = read_frames(folder, count=len(rig.sequence)).frames
-    method = method or ClassicalMethod(rig, threads=2)
+    method = ClassicalMethod(rig, threads=2)
     started = perf_counter()
     answer = method.answer(frames)
     seconds = perf_counter() - started
@@ -322,7 +308,7 @@ def reference(folder: Path, rig: "Rig", who: str) -> tuple[NDArray, Decoded]:
 
 def one_frame(folder: Path, rig: "Rig", scratch: Path, corners_px: NDArray | None = None) -> None:
     """One frame in the rig's range against the depth that all of them give there: `phase` on the
-    first fringe of each direction; where there are both, `crossed` and `crossed-net` on the mean of
+    first fringe of each direction; where there are both, `crossed` and `fringe-net` on the mean of
     the two, which is a crossed frame; where there is one, also with the mask given. Of all pixels,
     and of those between ``corners_px`` (n, 2) of a board."""
     frames, decoded = reference(folder, rig, "ours")
@@ -338,7 +324,7 @@ def one_frame(folder: Path, rig: "Rig", scratch: Path, corners_px: NDArray | Non
         # An order of the vertical fringes is the smaller step in depth.
         methods += [
             ("crossed", CrossedMethod(rig), "vertical"),
-            ("crossed-net", CrossedNetMethod(rig), "vertical"),
+            ("fringe-net", FringeNetMethod(rig, fringes="crossed"), "vertical"),
         ]
     else:
         Image.fromarray(known.astype(np.uint8) * 255).save(scratch / "mask.png")
@@ -389,8 +375,7 @@ def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
         frame = frames[rig.sequence.sinusoids(way)[0]]
         methods = {
             "local fit": PhaseMethod(rig, direction=way),
-            "fringe-net, one": FringeNetMethod(rig, fringes=way, members=1),
-            "fringe-net, three": FringeNetMethod(rig, fringes=way),
+            "fringe-net": FringeNetMethod(rig, fringes=way),
         }
         for title, method in methods.items():
             phase = method.route.measure(frame, on_object).wrapped_phase_rad

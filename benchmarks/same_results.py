@@ -91,14 +91,6 @@ METHODS = (
     "phase noisy",
     "phase own-mesh --split all",
     "phase vertical --fringe vertical",
-    "phase-net mini",
-    "phase-net mini --fringe vertical",
-    "phase-net mini --albedo any",
-    "phase-net mini --weights phase-net-one-albedo",
-    "phase-net mini --frames 2",
-    "phase-net three",
-    "phase-net noisy",
-    "phase-net deep --min-confidence 0.5",
     "unet-global-rmse small",
     "unet-global-rmse mini",
     "unet-individual-rmse small",
@@ -109,12 +101,10 @@ METHODS = (
     "crossed crossed --frames 3",
     "crossed crossed --min-confidence 0.5 --split all",
     "crossed mini",
-    "crossed-net crossed",
-    "crossed-net mini",
     "fringe-net crossed",
-    "fringe-net mini --members 1",
-    "classical-net mini",
-    "classical-net mini --direction horizontal --steps 6",
+    "fringe-net mini",
+    "fringe-net noisy",
+    "fringe-net deep --min-confidence 0.5",
     "no-such-method mini",
 )
 
@@ -320,13 +310,11 @@ def train(recorder: Recorder) -> None:
         )
         if trained and table in SCORED:
             recorder.predict("train", f"{out}/weights.safetensors small", number)
-    out = "runs/phase-net"
+    out = "runs/fringe-net"
     recorder.run(
-        "train", f"fpp-bench train phase-net --steps 2 --lights 0 --unions 0 --out {out}", out
+        "train", f"fpp-bench train fringe-net --steps 2 --rigs 1 --unions 0 --out {out}", out
     )
-    recorder.predict(
-        "train", f"phase-net small --weights {out}/phase-net-one-albedo.safetensors", 99
-    )
+    recorder.predict("train", f"fringe-net small --weights {out}/fringe-net-42.safetensors", 99)
     recorder.run("train", "fpp-bench train loss/l1 mini --out runs/refused")
     recorder.run("train", "fpp-bench train loss/none small --out runs/refused")
     recorder.run("train", "fpp-bench reproduce --list", output=True)
@@ -380,7 +368,6 @@ def reports(recorder: Recorder) -> None:
         "classical small --steps 4",
         "phase small",
         "phase small --fringe vertical --frames 3",
-        "phase-net noisy",
         "unet-individual-rmse small",
     )
     for number, method in enumerate(methods):

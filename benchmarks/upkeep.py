@@ -96,16 +96,11 @@ METHODS = {
     "classical-04-vertical": "classical --steps 4 --direction vertical",
     "classical-03-vertical": "classical --steps 3 --direction vertical",
     "classical-03-both-fewest": "classical --steps 3 --direction both --fewest",
-    "classical-net-03-vertical": "classical-net",
     "phase-horizontal": "phase --direction horizontal",
     "phase-vertical": "phase --direction vertical",
     "phase-02-horizontal": "phase --frames 2 --direction horizontal",
     "phase-03-horizontal": "phase --frames 3 --direction horizontal",
     "phase-03-vertical": "phase --frames 3 --direction vertical",
-    "phase-net-horizontal": "phase-net --direction horizontal",
-    "phase-net-vertical": "phase-net --direction vertical",
-    "phase-net-any-horizontal": "phase-net --direction horizontal --albedo any",
-    "phase-net-any-vertical": "phase-net --direction vertical --albedo any",
     "fringe-net-horizontal": "fringe-net --fringes horizontal",
     "fringe-net-vertical": "fringe-net --fringes vertical",
     "constant-standoff": "constant --at standoff",
@@ -120,7 +115,6 @@ row of its own."""
 CROSSED = {
     "crossed": "crossed",
     "crossed-03": "crossed --frames 3",
-    "crossed-net": "crossed-net",
     "fringe-net-crossed": "fringe-net",
 }
 """The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be
@@ -329,12 +323,11 @@ CURVES = "robustness_curves.png"
 """The picture of the test objects, below their tables."""
 DRAWN = (
     "fringe-net, 1 crossed",
-    "crossed-net, 1 frame",
     "Crossed, 1 frame",
     "Phase, 1 horizontal",
     "Classical 18+Gray, vertical",
 )
-"""The rows whose curves are drawn: four methods of one frame, and the classical one; more lines
+"""The rows whose curves are drawn: three methods of one frame, and the classical one; more lines
 can't be told apart."""
 SCORES = ("wrong_share", "confident_share", "coverage")
 TITLES = (
