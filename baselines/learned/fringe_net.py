@@ -23,7 +23,12 @@ from fpp_ml_bench.baselines.learned.warp import PLACES, Warp
 from fpp_ml_bench.baselines.phase.depth import Fitted, NearnessFit
 from fpp_ml_bench.baselines.phase.geometry import Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.local_fit import fringes
-from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation
+from fpp_ml_bench.baselines.phase.observe import (
+    Capture,
+    CrossedObservation,
+    Observation,
+    OneCarrier,
+)
 from fpp_ml_bench.baselines.phase.order import FringeOrder
 from fpp_ml_bench.constants import GREY_LEVELS, TAU
 
@@ -186,12 +191,14 @@ class LinePart:
     wrong where a texture misleads it), and then the phase (`after`)."""
 
     fringes: Fringes
+    model: OneCarrier
 
     def before(self, seen: Observation) -> Observation:
         """The observation of this object."""
         phases, inside = self.fringes.answer(seen, seen.greys[0])
         sigma_rad = np.float32(EXPECTED_SHARE) * phases.sigma_rad[0]
-        return replace(seen, inside=inside, other_phase=(phases.phase_rad[0], sigma_rad))
+        seen = self.model.with_object(seen, inside)
+        return replace(seen, other_phase=(phases.phase_rad[0], sigma_rad))
 
     @staticmethod
     def after(chosen: FringeOrder) -> FringeOrder:

@@ -154,7 +154,11 @@ class FringeNetMethod(RouteMethod[Measurement]):
             if given.fringes is None
             else given.fringes == "crossed"
         )
-        fringes = given.fringes or ("crossed" if crossed else "horizontal")
+        told = {} if given.fringes is None else {"direction": given.fringes}
+        way: Direction = "horizontal"
+        if not crossed:
+            way = fringe_options(self.name, rig, told).get("direction", way)
+        fringes = "crossed" if crossed else way
         if not 1 <= given.members <= MEMBERS:
             raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
         names = [given.weights] if given.weights else [f"{self.name}-{s}" for s in SEEDS]
@@ -174,15 +178,13 @@ class FringeNetMethod(RouteMethod[Measurement]):
             both = Fringes.of(carriers.step_rad, signs_of(carriers), networks, config.threshold)
             self.route = two_carriers(pair, PairPart(both).before, PairPart.after)
         else:
-            way: Direction = "vertical" if fringes == "vertical" else "horizontal"
-            fringe_options(self.name, rig, {"direction": way})
             other_pitch = pitch_setting(rig, way)
             model = OneCarrier(rig, Settings(way, min_confidence=given.min_confidence))
             phase = model.layer.absolute_phase(model.rig.standoff_m * MM_PER_M)
             step_rad = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)]])
             sign = np.sign(np.median(model.layer.gain))
             line = Fringes.of(step_rad, np.array([sign]), networks, config.threshold)
-            self.route = one_carrier(model, LinePart(line).before, LinePart.after)
+            self.route = one_carrier(model, LinePart(line, model).before, LinePart.after)
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
         more = "" if config.name in shipped_names(SHIPPED) else f" ({config.name})"
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"

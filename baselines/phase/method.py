@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
 from fpp_ml_bench.baselines.phase.depth import FringeMeasurement, Measurement, Reason
-from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES, OneCarrier, TwoCarriers
+from fpp_ml_bench.baselines.phase.observe import (
+    CROSSED_FRAMES,
+    OneCarrier,
+    TwoCarriers,
+    tells_depth,
+)
 from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
 from fpp_ml_bench.baselines.phase.route import AnyRoute, Measured, one_carrier, two_carriers
 from fpp_ml_bench.baselines.phase.settings import MIN_CONFIDENCE, PIXELWISE, Settings, steps_of
@@ -347,11 +352,12 @@ def crossed_name(submission: "Submission", begins: str) -> str | None:
 
 def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
     """``options`` of a method called ``name`` that computes with the fringes of one direction, by
-    default the rig's only one. Raises `PredictionError` for fringes that it would take for
-    others."""
+    default the only one that tells depth on the rig. Raises `PredictionError` for fringes that it
+    would take for others."""
     ways = rig.fringe_directions
-    if len(ways) == 1:
-        options = {"direction": ways[0], **options}
+    telling = ways if len(ways) < 2 else [way for way in ways if tells_depth(rig, way)]
+    if len(telling) == 1:
+        options = {"direction": telling[0], **options}
     direction = options.get("direction", "horizontal")
     if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
         return options  # refused by the method

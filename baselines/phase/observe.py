@@ -69,10 +69,11 @@ from fpp_ml_bench.baselines.phase.settings import PIXELWISE, Settings, steps_of
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.phase_shift import phase_weights, wrapped_phase
-from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, TAU
 from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 Frames = NDArray | Sequence[NDArray]
 EVERYWHERE = (slice(None), slice(None))
@@ -267,6 +268,12 @@ class MeasurementModel:
         return [self.resampling.image(image) for image in images]
 
 
+def tells_depth(rig: Rig, direction: Direction) -> bool:
+    """Whether the fringes of a direction change with depth at all: not where the projector stands
+    along them."""
+    return TAU * rig.periods_in_range(direction) >= LEAST_RANGE_RAD
+
+
 class OneCarrier(MeasurementModel):
     """Fringes of one direction, ``settings.frames`` of them (`steps_of`)."""
 
@@ -288,10 +295,14 @@ class OneCarrier(MeasurementModel):
             rig.working_range_mm,
             rig.periods_in_range(settings.direction),
         )
-        most_slack_mm = (
-            MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
-        )
-        self.slack_mm = min(self.slack_mm, most_slack_mm)
+        if not tells_depth(rig, settings.direction):
+            raise PredictionError(
+                f"{settings.direction} fringes tell no depth on this rig: over the working range "
+                f"{near:g} to {far:g} mm their phase changes by {TAU * periods_in_range:.2g} rad, "
+                f"because the projector stands along them; use the other direction, or crossed "
+                f"fringes (fpp-bench patterns --design)"
+            )
+        self.slack_mm = min(self.slack_mm, MOST_SLACK_PERIODS * (far - near) / periods_in_range)
         self.period_px = rig.image_px_per_period(settings.direction)
         self._scene = EmptyScene(
             rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey
@@ -368,6 +379,15 @@ class OneCarrier(MeasurementModel):
             slopes=slopes,
             mean_grey=mean_grey,
         )
+
+    def with_object(self, seen: Observation, inside: Mask) -> Observation:
+        """An observation of one frame with another object ``inside`` (h, w), over which the windows
+        are fitted again."""
+        _, fit = self._local_fits(seen.greys, seen.background, seen.crop, inside, True)
+        phase = wrapped(fit.phase_rad).astype(np.float32)
+        residual = wrapped(phase - seen.layer.infinity_rad).astype(np.float32)
+        slopes = phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
+        return replace(seen, inside=inside, fit=fit, phase_rad=phase, slopes=slopes)
 
     def _local_fits(
         self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool

@@ -117,7 +117,7 @@ def test_perfect_phases_give_perfect_depth(name: str) -> None:
         route = two_carriers(model, PairPart(both).before, PairPart.after)
         measured = two_carriers(model)
     else:
-        route = one_carrier(model, LinePart(both).before, LinePart.after)
+        route = one_carrier(model, LinePart(both, model).before, LinePart.after)
         measured = one_carrier(model)
     answer, before = route.measure(images[0]), measured.measure(images[0])
     shared = (answer.depth_mm > 0) & (before.depth_mm > 0) & target

@@ -33,6 +33,7 @@ from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.evaluation.submission.description import read_submission
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import Rig
 
 SIZE = RIG.camera.width
@@ -346,3 +347,13 @@ def test_refusals_name_what_came() -> None:
     ):
         with pytest.raises(PredictionError, match=next(iter(wrong))):
             PhaseMethod(RIG, **wrong)
+
+
+def test_fringes_along_the_baseline_are_refused() -> None:
+    beside = replace(paper_rig(224), translation_m=(0.16, 0.0, 0.0))
+    with pytest.raises(PredictionError, match="horizontal fringes tell no depth on this rig"):
+        load_method("phase", beside, direction="horizontal")
+    with pytest.raises(PredictionError, match="use the other direction"):
+        load_method("fringe-net", beside, fringes="horizontal")
+    for method in ("phase", "fringe-net"):
+        assert load_method(method, beside).frames_used == (18,)
