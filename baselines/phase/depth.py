@@ -547,7 +547,9 @@ def crossed_nearness(
     order = crossed_order(settings, seen, offered)
     nearness = order.candidates.nearness[1]
     if seen.moved is None:
-        fit = _of_best_sides(seen, _window_fit(seen, nearness))
+        fit = _window_fit(seen, nearness)
+        if seen.sigma_rad is None:  # phases of networks have edges of their own
+            fit = _of_best_sides(seen, fit)
     else:
         fit = _own_fit(seen, nearness, seen.moved)
     wall = np.zeros_like(seen.inside)
