@@ -3,6 +3,7 @@ could own, of all directions of the baseline and all standoffs.
 
     python benchmarks/draw_rigs.py
     python benchmarks/draw_rigs.py --picture data/rigs docs/pictures/rigs.png     of a built track
+    python benchmarks/draw_rigs.py --table crossed.json ...     of what fpp-eval wrote
 
 The rigs are drawn until each class of `CLASSES` has its number, and none of `NEAR_M` more than its
 share. Every second one has a calibration error of `GOOD_PX`, the others one drawn up to `POOR_PX`.
@@ -19,10 +20,12 @@ import numpy as np
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.design.rigs import axes_deg, drawn_rig
+from fpp_ml_bench.evaluation.result.parts import TrackScores
 from fpp_ml_bench.loaders.render.track import RIGS_FILE, TRACK_LIGHTS, track
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.style import figure, figure_png, styled
+from fpp_ml_bench.style import figure, figure_png, percent, styled, three_digits
+from fpp_ml_bench.tables import Table
 
 SEED = 20261128
 CLASSES = {"beside": 6, "above": 6, "oblique": 4}
@@ -84,7 +87,49 @@ def picture(folder: Path) -> bytes:
     return figure_png(drawn, reduced=True)
 
 
+def tables(files: list[Path]) -> str:
+    """Means of the methods whose scores ``fpp-eval --json`` wrote, and their errors by rig;
+    Markdown."""
+    methods = {
+        file.stem: TrackScores.model_validate_json(file.read_text(encoding="utf-8"))
+        for file in files
+    }
+    means, by_rig = [], []
+    for light in TRACK_LIGHTS:
+        for name, scores in methods.items():
+            mean, worst = scores.mean(light), scores.worst(light)
+            refused = sum(dataset.endswith(light) for dataset in scores.refused)
+            means.append(
+                {
+                    "light": light,
+                    "method": name,
+                    "per mille": three_digits(mean.per_mille),
+                    "answered": three_digits(mean.answered_per_mille),
+                    "projector px": three_digits(mean.projector_px),
+                    "x many frames": three_digits(mean.of_decoded),
+                    "missed": percent(mean.missing_share),
+                    "invented": percent(mean.invented_share),
+                    "worst rig": f"{three_digits(scores.datasets[worst].per_mille)} ({worst[4:6]})",
+                    "refused": str(refused),
+                }
+            )
+    for dataset in track():
+        rows = [scores.datasets.get(dataset) for scores in methods.values()]
+        cells = [
+            "refused" if row is None else f"{row.per_mille:.3g} / {row.answered_per_mille:.3g}"
+            for row in rows
+        ]
+        by_rig.append({"dataset": dataset, **dict(zip(methods, cells, strict=True))})
+    parts = (
+        Table.of("", rows, words=(0, 1) if rows is means else (0,)) for rows in (means, by_rig)
+    )
+    return "\n\n".join("\n".join(part.markdown()).strip() for part in parts)
+
+
 def main() -> int:
+    if sys.argv[1:2] == ["--table"]:
+        print(tables([Path(name) for name in sys.argv[2:]]))
+        return 0
     if sys.argv[1:2] == ["--picture"]:
         folder, file = map(Path, sys.argv[2:])
         file.write_bytes(picture(folder))

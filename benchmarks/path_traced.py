@@ -89,43 +89,53 @@ def first_harmonic(frames: NDArray[np.float64]) -> NDArray[np.complex128]:
 
 class PathTraced:
     """A scene in the path tracer: the same mesh in the same place, before the same plane, lit by
-    the same projector."""
+    the same projector, which shows ``screen`` float32 (H, W, 3)."""
 
-    def __init__(self, mi: Any, mesh: SolidMesh, rig: Rig, light: Light, folder: Path) -> None:
-        self.mi, self.rig, self.light = mi, rig, light
-        vertices_m, _ = place(mesh, "A0", rig, "fixed", 42)
+    def __init__(
+        self,
+        mi: Any,
+        mesh: SolidMesh,
+        rig: Rig,
+        light: Light,
+        folder: Path,
+        screen: NDArray[np.float32],
+        view: str = "A0",
+        whole: bool = False,
+    ) -> None:
+        """``whole``: all of the image is rendered, else the object's box."""
+        self.mi, self.rig, self.light, self.screen = mi, rig, light, screen
+        vertices_m, _ = place(mesh, view, rig, "fixed", 42)
         self.file = folder / f"{mesh.name}.ply"
         trimesh.Trimesh(vertices_m, mesh.faces, process=False).export(self.file)
         u = rig.camera.fx * vertices_m[:, 0] / vertices_m[:, 2] + rig.camera.cx
         v = rig.camera.fy * vertices_m[:, 1] / vertices_m[:, 2] + rig.camera.cy
         self.left, self.top = int(u.min()) - 2, int(v.min()) - 2
         self.width, self.height = int(u.max()) + 3 - self.left, int(v.max()) + 3 - self.top
+        if whole:
+            self.left, self.top, self.width, self.height = 0, 0, rig.camera.width, rig.camera.height
 
-    def render(self, length: int, samples: int, seed: int) -> Images:
-        """Light by paths of up to ``length`` pieces from the camera, ``samples`` a pixel; 0 beside
-        the object's box."""
-        start = time.process_time()
+    def radiance(self, length: int, samples: int, seed: int) -> NDArray[np.float64]:
+        """Light (H, W, 3) by paths of up to ``length`` pieces from the camera, ``samples`` a pixel;
+        0 beside what is rendered."""
         pixels = np.array(
             self.mi.render(self.mi.load_dict(self._scene(length, samples)), seed=seed),
             dtype=np.float64,
         )
-        seconds = time.process_time() - start
         whole = np.zeros((self.rig.camera.height, self.rig.camera.width, 3))
         whole[self.top : self.top + self.height, self.left : self.left + self.width] = pixels
+        return whole
+
+    def render(self, length: int, samples: int, seed: int) -> Images:
+        """White and first harmonic of the light that `harmonic_screen` gives."""
+        start = time.process_time()
+        whole = self.radiance(length, samples, seed)
+        seconds = time.process_time() - start
         white = whole[..., 0]
         return Images(white, 2 * whole[..., 1] - white + 1j * (2 * whole[..., 2] - white), seconds)
 
     def _scene(self, length: int, samples: int) -> dict[str, Any]:
         rig, surface, camera = self.rig, self.light.surface, self.rig.camera
         projector = rig.projector
-        row = first_harmonic(
-            np.array(pattern_profiles(rig))[list(rig.sequence.sinusoids("horizontal"))] / 255.0
-        )
-        row = row[: projector.height]
-        channels = np.stack(
-            [np.ones_like(row.real), (1 + row.real) / 2, (1 + row.imag) / 2], axis=1
-        )
-        screen = np.repeat(channels[:, None], projector.width, axis=1).astype(np.float32)
         centre = projector_centre_m(rig)
         # Mitsuba multiplies by pi, so a white surface that faces the lamp at 1 m has radiance
         # `scale`.
@@ -177,7 +187,7 @@ class PathTraced:
                 "to_world": self._looking(centre),
                 "irradiance": {
                     "type": "bitmap",
-                    "bitmap": self.mi.Bitmap(screen),
+                    "bitmap": self.mi.Bitmap(self.screen),
                     "raw": True,
                     "wrap_mode": "clamp",
                 },
@@ -202,6 +212,16 @@ class PathTraced:
         return self.mi.ScalarTransform4f().look_at(
             origin=origin.tolist(), target=target.tolist(), up=[0, -1, 0]
         )
+
+
+def harmonic_screen(rig: Rig) -> NDArray[np.float32]:
+    """White and the two parts of the horizontal fringes' first harmonic, in three channels."""
+    row = first_harmonic(
+        np.array(pattern_profiles(rig))[list(rig.sequence.sinusoids("horizontal"))] / 255.0
+    )
+    row = row[: rig.projector.height]
+    channels = np.stack([np.ones_like(row.real), (1 + row.real) / 2, (1 + row.imag) / 2], axis=1)
+    return np.repeat(channels[:, None], rig.projector.width, axis=1).astype(np.float32)
 
 
 def _field_degrees(pinhole: Any) -> float:
@@ -415,7 +435,7 @@ def compare(mi: Any, name: str, args: argparse.Namespace, folder: Path) -> list[
     rig, mesh = paper_rig(args.size), mesh_of(name)
 
     def path_traced(light: Light, length: int, samples: int) -> tuple[Images, Images]:
-        scene = PathTraced(mi, mesh, rig, light, folder)
+        scene = PathTraced(mi, mesh, rig, light, folder, harmonic_screen(rig))
         return scene.render(length, samples, seed=1), scene.render(length, samples, seed=2)
 
     start = time.process_time()

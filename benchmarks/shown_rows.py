@@ -27,15 +27,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
+from upkeep import best_rows
 
 from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.leaderboard.page.page import of_one_target, write_page
+from fpp_ml_bench.leaderboard.page.page import write_page
 from fpp_ml_bench.leaderboard.ranking import (
     Group,
     Ranked,
-    is_trivial,
     rank,
     read_entries,
     shipped_rows,
@@ -90,26 +90,6 @@ def first_screen() -> bytes:
         return shot.read_bytes()
 
 
-def of_one_frame(groups: Sequence[Group]) -> tuple[Group, list[Ranked]]:
-    """The first table of one frame on the metric track, and its rows without trivial ones, the
-    least error first."""
-    groups = [
-        group
-        for group in groups
-        if group.key.data_title == groups[0].key.data_title and group.vouched
-    ]
-    of_class = [
-        group
-        for group in groups
-        if group.key.frames == FRAMES_CLASSES[0] and group.key.track == "metric"
-    ]
-    group = of_one_target(of_class)[0]
-    rows = [
-        row for row in group.rows if not is_trivial(row) and row.value(row.rank_key) is not None
-    ]
-    return group, sorted(rows, key=lambda row: (row.value(row.rank_key), row.short_name))
-
-
 def by_charge(group: Group, row: Ranked, charge_mm: np.ndarray) -> np.ndarray:
     """The two-sided MAE of a row at other charges, in mm: it is linear in them."""
     error, missing, invented = (
@@ -123,7 +103,10 @@ def by_charge(group: Group, row: Ranked, charge_mm: np.ndarray) -> np.ndarray:
 @styled
 def charge_curves() -> bytes:
     """Two-sided MAE against the charge, PNG."""
-    group, rows = of_one_frame(rank(read_entries(shipped_rows())))
+    best = best_rows(rank(read_entries(shipped_rows())), FRAMES_CLASSES[0])
+    if best is None:
+        raise SystemExit("no row of one frame to draw")
+    group, rows = best
     drawn, (panel,) = panels(["One frame, two-sided MAE against the charge"], 1, 7.0, 4.2)
     for number, row in enumerate(rows[:CURVES]):
         errors = by_charge(group, row, CHARGES_MM)

@@ -50,7 +50,7 @@ from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
 from fpp_ml_bench.evaluation.metrics import OBJECT_KEY
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, FramesClass
 from fpp_ml_bench.evaluation.result.file import read_result
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Robustness
@@ -259,31 +259,42 @@ _COLUMNS = (
 )
 
 
-def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
-    """What README shows of the first dataset's metric track, against exact depth where a row is:
-    the `SHOWN` methods of one frame with the least two-sided MAE, without trivial ones, and the
-    best classical method with its full sequence. Only rows that the maintainers vouch for count,
-    and where there are none, results of this machine."""
-    first = [
+def best_rows(groups: Sequence[Group], frames: FramesClass) -> tuple[Group, list[Ranked]] | None:
+    """The table of a class of frames of the first dataset's metric track, against exact depth where
+    a row is, and its rows without trivial ones, the least two-sided MAE first. Only rows that the
+    maintainers vouch for count, and where there are none, results of this machine; None without
+    such a table."""
+    of_class = [
         group
         for group in groups
-        if group.key.data_title == groups[0].key.data_title and group.vouched == groups[0].vouched
+        if group.key.data_title == groups[0].key.data_title
+        and group.vouched == groups[0].vouched
+        and group.key.frames == frames
+        and group.key.track == "metric"
     ]
+    for group in of_one_target(of_class)[:1]:
+        rows = [
+            row
+            for row in group.rows
+            if row.provenance != SELF_REPORTED
+            and not is_trivial(row)
+            and (row.entry.vouched or not group.vouched)
+            and row.value(row.rank_key) is not None
+        ]
+        return group, sorted(rows, key=lambda row: (row.value(row.rank_key), row.short_name))
+    return None
+
+
+def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
+    """What README shows: the `SHOWN` best methods of one frame, and the best classical method with
+    its full sequence (`best_rows`)."""
     shown = []
     for frames, count in ((FRAMES_CLASSES[0], SHOWN), (FRAMES_CLASSES[-1], 1)):
-        of_class = [
-            group for group in first if group.key.frames == frames and group.key.track == "metric"
-        ]
-        for group in of_one_target(of_class)[:1]:
-            rows = [
-                row for row in group.rows if row.provenance != SELF_REPORTED and not is_trivial(row)
-            ]
-            rows = [row for row in rows if row.entry.vouched or not group.vouched]
-            rows = [row for row in rows if row.value(row.rank_key) is not None]
+        if best := best_rows(groups, frames):
+            group, rows = best
             if frames == FRAMES_CLASSES[-1]:
                 rows = [row for row in rows if row.entry.row.submission.method == "classical"]
-            best = sorted(rows, key=lambda row: (row.value(row.rank_key), row.short_name))
-            shown += [(group, row) for row in best[:count]]
+            shown += [(group, row) for row in rows[:count]]
     return shown
 
 

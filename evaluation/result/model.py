@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from fpp_ml_bench.constants import WORKING_RANGE_MM
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.metrics import METRICS, RANKED, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import (
@@ -44,6 +43,7 @@ from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, Scored, Sigm
 from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.loaders.storage.benchmark import Counts, known_problem
+from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
 
 Scores = dict[str, float | None]
@@ -321,10 +321,10 @@ def check_charge(charge_mm: float | None, data: parts.DatasetInfo, mode: str) ->
             f"charge_mm: expected {'none' if mode == 'paper' else 'one'} in {mode} mode, got "
             f"{charge_mm}"
         )
-    near_mm, far_mm = WORKING_RANGE_MM
-    if charge_mm is not None and data.known is not None and charge_mm != (far_mm - near_mm) / 2:
+    expected_mm = paper_rig().half_range_mm
+    if charge_mm is not None and data.known is not None and charge_mm != expected_mm:
         raise ValueError(
-            f"charge_mm: that of {data.known.title} is {(far_mm - near_mm) / 2:g}, got {charge_mm}"
+            f"charge_mm: that of {data.known.title} is {expected_mm:g}, got {charge_mm}"
         )
 
 

@@ -108,8 +108,7 @@ def test_short_names_of_shipped_rows(shipped):
         names |= {row.entry.path.stem: row.short_name for row in group.rows}
     expected = {
         "phase-03-vertical": "Phase, 3 vertical",
-        "phase-net-horizontal": "phase-net, 1 horizontal",
-        "classical-net-03-vertical": "classical-net 3+Gray, vertical",
+        "fringe-net-crossed": "fringe-net, 1 crossed",
         "classical-03-both-fewest": "Classical 3, both, no Gray",
         "small-unet-individual-rmse-seed_1": "UNet RMSE s1",
         "small-unet-individual-rmse-horizontal": "UNet RMSE horizontal",
@@ -214,7 +213,6 @@ ASSUMED = {
         "one albedo, a lit background",
         "one albedo for all surfaces and a lit background",
     ),
-    "phase-net-any-vertical": ("a lit background", "a lit background; not one albedo"),
 }
 
 

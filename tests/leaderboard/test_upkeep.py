@@ -150,7 +150,7 @@ def test_markers_must_be_there(text, readme, capsys):
     assert upkeep.main(["readme", str(readme.with_name("none.md"))]) == 2
 
 
-@pytest.mark.parametrize("row", ["classical-18-both", "phase-net-any-vertical"])
+@pytest.mark.parametrize("row", ["classical-18-both", "phase-vertical"])
 def test_a_rows_command_is_of_the_method_that_was_scored(row):
     name, *options = upkeep.METHODS[row].split()
     words = [name, "data", *options, "--out", "predictions"]
