@@ -150,7 +150,7 @@ class Fringes:
         if warp.needed:
             phase_rad, logit, *sigmas = warp.back(phase_rad, [logit, *sigma_rad], grey.shape)
             sigma_rad = np.stack(sigmas)
-        inside = seen.inside if seen.given else logit > self.threshold
+        inside = seen.inside if seen.given else (logit > self.threshold) & ~seen.beyond
         return Phases(phase_rad, sigma_rad), inside
 
 

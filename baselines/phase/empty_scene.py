@@ -110,6 +110,9 @@ normal noise reaches it in 1 of 16,000 points."""
 RESPONSE_POWERS = (2, 3)
 """Powers of the pattern that are fitted beside the pattern itself: a projector's gamma bends the
 pattern before the light falls off."""
+EDGE_PX = 3
+"""Width in px of the band along the border of the projector's image on the plane in which nothing
+is predicted: pixels there are lit in part, and a calibration shifts the border."""
 CURVE_POWERS = (1, 2, 3)
 """Powers of the fitted light whose sum is the plane's grey level: a gamma of projector or camera
 bends it."""
@@ -120,7 +123,7 @@ class Background:
     """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives
     per 1/m^2 of irradiance, NaN where neither image nor user tells; ``residual`` float32 (H, W):
     image minus prediction; ``share``: of the tiles that show the plane, 0 for none; ``weights``: of
-    the lamp's terms 1, x, y, x^2, xy, y^2; ``textured``: the plane's albedo is taken to change from
+    `EmptyScene`'s terms; ``textured``: the plane's albedo is taken to change from
     place to place."""
 
     ambient_grey: float
@@ -149,8 +152,8 @@ class Background:
 
 class EmptyScene:
     """The background plane as a rig and direction show it; computed once, then fitted to every
-    image. Its phase is calibrated; ambient light, the lamp's strength and a slow change of its
-    sheen across the image are fitted to the pixels that show the plane. ``white_grey`` and
+    image. Its phase is calibrated; ambient light, the lamp's strength and slow changes of both and of
+    the contrast across the image are fitted to the pixels that show the plane. ``white_grey`` and
     ``ambient_grey``, if the user gives them, are a photometric calibration: the grey level of a
     white pattern on a surface that faces the projector at the near end of the working range, and of
     a surface in ambient light alone. Without them an image that does not show the plane, or whose
@@ -173,11 +176,11 @@ class EmptyScene:
         # Without a known background nothing is predicted, and no image shows it.
         depth_m = np.nan if rig.background_m is None else rig.background_m
         self._phase = layer.absolute_phase(depth_m * MM_PER_M)
-        self._fall_off = plane_irradiance(rig, depth_m)
+        lit, self._edge = pattern_on_plane(rig, depth_m)
+        self.beyond = self._edge | (lit == 0)
+        self._fall_off = lit * plane_irradiance(rig, depth_m)
         self._light = np.nan_to_num(self._fall_off * (0.5 + 0.5 * np.cos(self._phase)))
-        self._terms = [
-            np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)
-        ]
+        self._terms = self._light_terms(self._fall_off, np.cos(self._phase), *self._rays)
         self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), *self._light.shape)
         self._mean, self._square = self._tiles(self._light), self._tiles(self._light * self._light)
 
@@ -209,6 +212,7 @@ class EmptyScene:
         residual = grey - np.float32(ambient_grey)
         for weight, term in zip(weights, self._terms, strict=True):
             residual -= np.float32(weight) * term
+        residual[self._edge] = 0
         return Background(
             float(ambient_grey), float(weights[0]), noise, residual, share, tuple(weights)
         )
@@ -216,11 +220,25 @@ class EmptyScene:
     def predicted(self, background: Background, shift_rad: float, where: Crop) -> Image:
         """Grey levels, float32 (h, w), that the plane has on the pixels ``where`` of a frame whose
         fringe is shifted by ``shift_rad``, in the light that ``background`` was fitted to."""
-        terms = _quadratic(*(axis[where] for axis in self._rays))
-        lamp = sum(weight * term for weight, term in zip(background.weights, terms, strict=False))
-        fringe = 0.5 + 0.5 * np.cos(self._phase[where] + shift_rad)
-        plane = np.nan_to_num(lamp * self._fall_off[where] * fringe).astype(np.float32)
-        return np.float32(background.ambient_grey) + plane
+        rays = (axis[where] for axis in self._rays)
+        wave = np.cos(self._phase[where] + shift_rad)
+        terms = self._light_terms(self._fall_off[where], wave, *rays)
+        plane = np.full(wave.shape, background.ambient_grey, np.float32)
+        for weight, term in zip(background.weights, terms, strict=False):
+            plane += np.float32(weight) * term
+        return plane
+
+    @staticmethod
+    def _light_terms(fall_off: NDArray, wave: NDArray, x: NDArray, y: NDArray) -> list[Image]:
+        """Terms (h, w) whose weighted sum, with ambient light, is the plane's light where its fringe
+        has the cosine ``wave``: first the fringe as projected, then a lamp of uneven brightness, a
+        contrast that changes over the image by the lenses' blur, and ambient light that falls off
+        with the camera's lens."""
+        light, squared = fall_off * (0.5 + 0.5 * wave), x * x + y * y
+        terms = [light * term for term in (*_quadratic(x, y), squared * squared)]
+        # A contrast that is off everywhere can't be told from ambient light.
+        terms += [fall_off * wave * term for term in _quadratic(x, y)[1:]]
+        return [np.nan_to_num(term).astype(np.float32) for term in (*terms, squared)]
 
     def _tiles(self, image: NDArray) -> NDArray[np.float64]:
         """Means over whole tiles."""
@@ -294,6 +312,21 @@ def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
     return ahead / (squared * np.sqrt(squared))
 
 
+def pattern_on_plane(rig: Rig, depth_m: float) -> tuple[Image, Mask]:
+    """Where the projector lights a plane square to the camera's axis, 1 or 0 float32 (H, W), and the
+    band of `EDGE_PX` along the border of that; everywhere and nowhere for no known plane."""
+    x, y = rig.camera.rays()
+    if not np.isfinite(depth_m):
+        return np.ones(x.shape, np.float32), np.zeros(x.shape, bool)
+    u, v = rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
+    width, height = rig.projector.width, rig.projector.height
+    lit = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+    square = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
+    plain = lit.astype(np.uint8)
+    edge = cv2.dilate(plain, square) != cv2.erode(plain, square, borderValue=1)
+    return lit.astype(np.float32), edge
+
+
 def _quadratic(x: NDArray, y: NDArray) -> tuple[NDArray, ...]:
     return np.ones_like(x), x, y, x * x, x * y, y * y
 
@@ -317,6 +350,7 @@ class CrossedEmptyScene:
         self._period_px = carriers.period_px
         self._margin = 2 * max(1, round(ERODED_PERIODS * carriers.period_px / stride)) + 1
         phases = self._phases()
+        self._lit, self._edge = pattern_on_plane(carriers.rig, self._depth_m)
         self._grid_rad = wrapped(phases[:, ::stride, ::stride]).astype(np.float32)
         self._grid = _linear(carriers.rig)[
             :, ::stride, ::stride
@@ -334,19 +368,22 @@ class CrossedEmptyScene:
 
     def _light(self, phases: NDArray) -> list[Image]:
         """Terms (H, W) whose weighted sum is the plane's light at ``phases`` (2, H, W): a lamp of
-        uneven brightness, carriers of any contrast, a projector's response, which bends the pattern
-        before the light falls off, and ambient light."""
+        uneven brightness, carriers of any contrast, uneven by the lenses' blur, a projector's
+        response, which bends the pattern before the light falls off, and ambient light, which falls
+        off with the camera's lens."""
         waves = (
             weight * np.cos(phase)
             for weight, phase in zip(self._carriers.family.weights, phases, strict=True)
         )
         first, second = (wave.astype(np.float32) for wave in waves)
         fall_off = plane_irradiance(self._carriers.rig, self._depth_m).astype(np.float32)
-        fall_off /= np.float32(np.median(fall_off))
-        pattern, (_, x, y) = 1 + first + second, _linear(self._carriers.rig)
-        terms = [fall_off * term * pattern for term in _quadratic(x, y)]
+        fall_off *= self._lit / np.float32(np.median(fall_off))
+        pattern, (one, x, y) = 1 + first + second, _linear(self._carriers.rig)
+        lamp, squared = [fall_off * term for term in _quadratic(x, y)], x * x + y * y
+        terms = [term * pattern for term in (*lamp, fall_off * squared * squared)]
         terms += [fall_off * pattern**power for power in RESPONSE_POWERS]
-        return [*terms, fall_off * first, fall_off * second, np.ones_like(x)]
+        terms += [term * wave for wave in (first, second) for term in lamp]
+        return [*terms, one, squared]
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:
         """Fit the plane to an image float32 (H, W), demodulated as ``seen``: its ``residual``
@@ -376,8 +413,9 @@ class CrossedEmptyScene:
         if (
             np.subtract(*np.percentile(light, [95, 5])) < PLAIN_SIGMAS * own_noise
         ):  # no fringe for a gamma to bend
+            residual = self._predicted(grey - first, grey - np.float32(dark))
             return Background(
-                dark, np.nan, max(_noise_of(samples - light), noise), grey - first, share, ()
+                dark, np.nan, max(_noise_of(samples - light), noise), residual, share, ()
             )
         curve = np.stack([light**power for power in CURVE_POWERS] + [np.ones_like(light)], axis=1)
         scale = np.maximum(np.abs(curve).max(axis=0), 1e-6)
@@ -386,8 +424,22 @@ class CrossedEmptyScene:
         plane = ((bend[2] * first + bend[1]) * first + bend[0]) * first + bend[3]
         if noise > TEXTURED * own_noise:
             residual = self._of_any_albedo(grey, plane, dark, own_noise)
+            residual = self._predicted(residual, grey - np.float32(dark))
             return Background(dark, np.nan, own_noise, residual, share, (), textured=True)
-        return Background(dark, np.nan, noise, grey - plane, share, ())
+        residual = self._predicted(grey - plane, grey - np.float32(dark))
+        return Background(dark, np.nan, noise, residual, share, ())
+
+    @property
+    def beyond(self) -> Mask:
+        """Pixels (H, W) whose plane is not lit by the projector, or at the border of that."""
+        return self._edge | (self._lit == 0)
+
+    def _predicted(self, residual: Image, lit_grey: Image) -> Image:
+        """``residual`` (H, W); where the projector does not light the plane ``lit_grey``, the grey
+        levels above a dark pixel's, and 0 along the border."""
+        residual = np.where(self._lit > 0, residual, lit_grey)
+        residual[self._edge] = 0
+        return residual
 
     def _of_any_albedo(self, grey: Image, plane: Image, dark: float, noise_grey: float) -> Image:
         """Misfit of a plane whose albedo changes from place to place, in units of the noise: the
@@ -423,9 +475,10 @@ class CrossedEmptyScene:
         are nowhere to be seen, the points without any fringe: they are blurred out, or there is no
         wall."""
         modulation = seen.modulation
+        lit = ~self.beyond[:: self._stride, :: self._stride]
         fringed, plain = (
-            modulation.min(axis=0) > noise_grey / 4,
-            modulation.max(axis=0) < noise_grey / 2,
+            lit & (modulation.min(axis=0) > noise_grey / 4),
+            lit & (modulation.max(axis=0) < noise_grey / 2),
         )
         off_rad = wrapped(seen.phase_rad - self._grid_rad)
         moved_rad = np.zeros((2, 1, 1), np.float32)

@@ -127,7 +127,9 @@ their windows cover the background too."""
 class Capture:
     """Frames measured around the object: maps (h, w) of the part ``crop`` of images of ``shape``
     (H, W). ``greys``: float32 grey levels of each frame; ``background``: fit of the empty scene;
-    ``inside``: object, ``given`` by the user or found; ``period_px``: of the fringe in the image,
+    ``inside``: object, ``given`` by the user or found; ``beyond``: pixels that the
+    projector lights neither on the plane nor on an object, none where that was not looked for (a
+    given mask, several frames); ``period_px``: of the fringe in the image,
     the longer one of two; orders are chosen on a grid of every ``stride``-th pixel, for depths of
     ``range_mm``. An image without an object has a crop of one pixel."""
 
@@ -141,6 +143,7 @@ class Capture:
     background: Background
     inside: Mask
     given: bool
+    beyond: Mask
 
     @property
     def pixelwise(self) -> bool:
@@ -340,6 +343,7 @@ class OneCarrier(MeasurementModel):
         greys = tuple(frame[crop].astype(np.float32) for frame in images)
         background = replace(background, residual=background.residual[crop])
         layer, inside, mean_grey = self.layer.at(crop), region[crop], None
+        dark = np.zeros_like(inside)
         if len(greys) > 1 and mask is None:
             planes = [self._scene.predicted(background, shift, crop) for shift in self.shifts_rad]
             misfits = [grey - plane for grey, plane in zip(greys, planes, strict=True)]
@@ -357,7 +361,11 @@ class OneCarrier(MeasurementModel):
             # The share of a window on the object is what the use of slopes needs.
             fit = FringeFit(phase, modulation, self.windows[1].moment(inside.astype(np.float32)))
         else:
-            inside, fit = self._local_fits(greys, background, crop, inside, mask is not None)
+            if mask is None:
+                dark = unlit(np.maximum.reduce(greys), background, self.period_px)
+            inside, fit = self._local_fits(
+                greys, background, crop, inside & ~dark, dark, mask is not None
+            )
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
@@ -372,6 +380,7 @@ class OneCarrier(MeasurementModel):
             background=background,
             inside=inside,
             given=mask is not None,
+            beyond=dark & self._scene.beyond[crop],
             layer=layer,
             shifts_rad=self.shifts_rad,
             fit=fit,
@@ -383,21 +392,27 @@ class OneCarrier(MeasurementModel):
     def with_object(self, seen: Observation, inside: Mask) -> Observation:
         """An observation of one frame with another object ``inside`` (h, w), over which the windows
         are fitted again."""
-        _, fit = self._local_fits(seen.greys, seen.background, seen.crop, inside, True)
+        _, fit = self._local_fits(
+            seen.greys, seen.background, seen.crop, inside, np.zeros_like(inside), True
+        )
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - seen.layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
         return replace(seen, inside=inside, fit=fit, phase_rad=phase, slopes=slopes)
 
     def _local_fits(
-        self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool
+        self,
+        greys: Sequence[Image],
+        background: Background,
+        crop: Crop,
+        inside: Mask,
+        dark: Mask,
+        given: bool,
     ) -> tuple[Mask, FringeFit]:
         """Object mask and local fits of one or two frames, each window starting from the phase of
-        the last; ``region``: where frames differ from the empty scene, or the ``given`` mask."""
-        period_px, inside, grey = self.period_px, region, greys[0]
-        if not given:
-            dark = unlit(np.maximum.reduce(greys), background, period_px)
-            inside = region & ~dark
+        the last; ``inside``: where frames differ from the empty scene and are not ``dark``, or the
+        ``given`` mask."""
+        period_px, grey = self.period_px, greys[0]
         carrier = self._carrier[crop]
         phase, _ = carrier_fit(grey, inside, carrier, self.windows[0])
         for window in self.windows[1:]:
@@ -529,12 +544,14 @@ class TwoCarriers(MeasurementModel):
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
         grid = tuple(slice(part.start // stride, -(-part.stop // stride)) for part in crop)
+        beyond = np.zeros_like(inside)
         if mask is None and moved is None:
             faint = seen.modulation[:, *grid].max(axis=0) < FAINT_SIGMAS * self.demodulator.noise(
                 background.noise_grey
             )
             dark = unlit(grey[crop], background, period_px, UNLIT_PX)
             inside = lit_part(inside, dark | repeated(faint, stride, inside.shape))
+            beyond = dark & self._scenes[0].beyond[crop]
         carriers = self.carriers.at(crop)
         points, mean_grey = (
             inside[::stride, ::stride],
@@ -562,6 +579,7 @@ class TwoCarriers(MeasurementModel):
             background=background,
             inside=inside,
             given=mask is not None,
+            beyond=beyond,
             carriers=carriers,
             moved=moved,
             grey=grey[crop],
