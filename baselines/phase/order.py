@@ -43,6 +43,12 @@ LEAST_BRIGHTNESS = 1e-3
 PHASE_SIGMA_RAD = 0.35
 """Standard deviation, in rad, of a carrier's phase in a window, edges and texture included. A
 larger one gives the evidence less weight beside neighbours."""
+LEAST_SIGMA_RAD = 0.1
+"""The same of phases whose uncertainty networks state, where they state none: a calibration that is
+off. Chosen, with `SHARED_SIGMAS`, on validation objects before four validation rigs."""
+SHARED_SIGMAS = 3.0
+"""Stated standard uncertainties of a phase that count as one: neighbours share most of what a
+network saw, and so its error."""
 MOST_AGREEMENT = 2.83**2 / 2
 """Largest cost of a phase misfit, that of 2.83 standard deviations: beyond it a window across an
 edge may show anything."""
@@ -151,9 +157,13 @@ def standoff_cost(seen: Observation, offered: FringeCandidates, settings: Settin
 def agreement_cost(
     seen: CrossedObservation, offered: CrossedCandidates, settings: Settings
 ) -> Image:
-    """By the distance of both phases from the candidate's: s standard deviations cost s^2 / 2."""
-    misfit = (offered.misfit_rad / np.float32(PHASE_SIGMA_RAD)) ** 2 / 2
-    return np.minimum(misfit, np.float32(MOST_AGREEMENT))
+    """By the distance of both phases from the candidate's: s standard deviations cost s^2 / 2.
+    Where networks state the uncertainty of the phases, it is theirs."""
+    sigma_rad: Image | np.float32 = np.float32(PHASE_SIGMA_RAD)
+    if seen.sigma_rad is not None:
+        stated = seen.sigma_rad[:, :: seen.stride, :: seen.stride].max(axis=0)
+        sigma_rad = np.hypot(np.float32(LEAST_SIGMA_RAD), np.float32(SHARED_SIGMAS) * stated)
+    return np.minimum((offered.misfit_rad / sigma_rad) ** 2 / 2, np.float32(MOST_AGREEMENT))
 
 
 def pixel_light_cost(
