@@ -24,8 +24,7 @@ DOORS = {
         "loaders/storage/store.py",  # without the bodies; `datasets` maps what was checked
     },
     r"np\.(load|fromfile|memmap|loadtxt|genfromtxt)|pickle\.loads?|torch\.load|safe_open": {
-        "baselines/learned/rig_views.py",  # images that it made itself
-        "baselines/learned/scenes.py",  # views that it made itself
+        "baselines/learned/images.py",  # images that it made itself
         "baselines/robustness/axes.py",  # renderings that it made itself
         "baselines/registry.py",  # of the parent process
         "baselines/run.py",  # the shape of a prediction that it made itself
