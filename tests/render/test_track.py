@@ -147,6 +147,8 @@ def test_from_prediction_to_table_and_row(small, tmp_path, capsys) -> None:
     for said in ("1 frame", "complete already"):
         assert main(["predict", "crossed", str(small), "--out", str(below)]) == 0
         assert said in capsys.readouterr().out
+    assert main(["predict", "crossed", str(small), "--frames", "3", "--out", str(below)]) == 2
+    assert "rig-02-paper" in capsys.readouterr().err
     one = str(below / "rig-02-paper"), str(small / "rig-02-paper")
     assert main_eval([*one, "--target", "depth_exact", "--json", str(result)]) == 0
     words = [str(below), str(small), "--json", str(table), "--into", str(result)]
