@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.evaluation.result.model import Result
@@ -88,14 +89,13 @@ def dataset_scores(result: Result, dataset: DatasetFolder) -> DatasetScores:
     ]
     decoded_mm = math.fsum(decoded) / len(decoded) if decoded else 0.0
     answered_mm = result.metrics.object_valid_mae_mm
+    per_mm = PER_MILLE / (rig.standoff_m * MM_PER_M)
     light = dataset.manifest.settings.get("light", {})
     return DatasetScores(
         light=str(light.get("name", "unknown")),
         mae_mm=error_mm,
-        per_mille=PER_MILLE * error_mm / rig.standoff_mm,
-        answered_per_mille=None
-        if answered_mm is None
-        else PER_MILLE * answered_mm / rig.standoff_mm,
+        per_mille=per_mm * error_mm,
+        answered_per_mille=None if answered_mm is None else per_mm * answered_mm,
         projector_px=error_mm * rig.projector_px_per_mm,
         of_decoded=error_mm / decoded_mm if decoded_mm else None,
         missing_share=result.metrics.object_missing_share,

@@ -9,13 +9,19 @@ from rich.text import Text
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.baselines.run import explain_predict, predict_split
-from fpp_ml_bench.baselines.timing import check_target, time_method, write_timing
+from fpp_ml_bench.baselines.timing import (
+    check_same_method,
+    check_target,
+    time_method,
+    write_timing,
+)
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command, new_file
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import Timing
+from fpp_ml_bench.evaluation.submission.description import read_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import REFUSED_FILE, SUBMISSION_FILE
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder, datasets_below
@@ -81,7 +87,8 @@ def _predict_all(
     chosen: MethodSettings, datasets: dict[str, Path], split: str, out: Path | RemoteFolder
 ) -> None:
     """Predict each of ``datasets`` into a folder of its name, finished ones kept. Where the method
-    can't be for the rig, the folder says so."""
+    can't be for the rig, the folder says so. Raises `SubmissionError` for predictions of another
+    method there."""
     find(chosen.name)  # an unknown method is refused by no rig
     opened = {name: DatasetFolder(place) for name, place in datasets.items()}
     samples = sum(len(dataset.samples(split)) for dataset in opened.values())
@@ -90,16 +97,17 @@ def _predict_all(
     with working_copy(out) as (below, save), bar as advance:
         for name, dataset in opened.items():
             count, folder = len(dataset.samples(split)), below / name
-            if (folder / SUBMISSION_FILE).is_file():
-                said[name] = f"{count} predictions, complete already"
-                advance(count)
-                continue
             try:
                 method = chosen.load(dataset)
             except PredictionError as refusal:
                 folder.mkdir(parents=True, exist_ok=True)
                 write_atomically(folder / REFUSED_FILE, f"{refusal}\n".encode())
                 said[name] = f"refused: {refusal}"
+                advance(count)
+                continue
+            if (folder / SUBMISSION_FILE).is_file():
+                check_same_method(folder, read_submission(folder), method)
+                said[name] = f"{count} predictions, complete already"
                 advance(count)
                 continue
             seconds = predict_split(dataset.without_truth(), method, split, folder, advance)

@@ -346,10 +346,6 @@ class Rig:
         return abs(float(near - far)) / self.pitch(direction)
 
     @property
-    def standoff_mm(self) -> float:
-        return self.standoff_m * MM_PER_M
-
-    @property
     def projector_px_per_mm(self) -> float:
         """Projector px by which the pattern's image of the central camera pixel moves for a mm of
         depth at the standoff: central difference over a thousandth of it."""
@@ -357,7 +353,7 @@ class Rig:
         ends = self.standoff_m * np.array([[0.9995], [1.0005]])
         u, v = self.project(ends * np.array([[float(x), float(y), 1.0]]))
         moved_px = math.hypot(float(u[1] - u[0]), float(v[1] - v[0]))
-        return moved_px / (0.001 * self.standoff_mm)
+        return moved_px / (0.001 * self.standoff_m * MM_PER_M)
 
     def image_px_per_period(self, direction: Direction) -> float:
         """Image px a fringe period covers at the image centre, on a plane square to the axis at the

@@ -17,8 +17,8 @@ from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.scene import BuildSettings, light_of_volume, volume_scale
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
-TRACK, TRACK_VERSION = "rigs", 1
-"""Name of the preset, and version of the rigs and their datasets."""
+TRACK = "rigs"
+"""Name of the preset; the version is that of `storage.benchmark.TRACK`."""
 RIGS_FILE = Path(__file__).with_name("track_rigs.json")
 TRACK_LIGHTS = ("paper", "workshop")
 TRACK_VIEWS = (VIEWS[0], VIEWS[2])

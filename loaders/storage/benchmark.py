@@ -165,6 +165,24 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
     return None
 
 
+def _intended_of_track(manifest: Manifest) -> str | None:
+    """The dataset of the track whose settings a dataset was built with, whatever its content is;
+    None for others."""
+    from fpp_ml_bench.loaders.render.track import track  # reading a dataset needs no renderer
+
+    described = manifest.settings, manifest.rig
+    if manifest.origin != GENERATED or "views" not in manifest.settings:
+        return None
+    return next(
+        (
+            name
+            for name, settings in track().items()
+            if described == (settings.describe(), settings.stated_rig.to_dict())
+        ),
+        None,
+    )
+
+
 def benchmark_sentence(manifest: Manifest) -> tuple[bool, str]:
     """A sentence about what a dataset is by its manifest; False beside it for a benchmark's
     settings with other content."""
@@ -172,6 +190,12 @@ def benchmark_sentence(manifest: Manifest) -> tuple[bool, str]:
     for name, content in TRACK.content.items():
         if content == manifest.content:
             return True, f"this is {name} of {TRACK.title}"
+    if part := _intended_of_track(manifest):
+        return False, (
+            f"built with the settings of {part} of {TRACK.title}, but not its content: its scores "
+            f"do not compare with that track's. Build it again with this version of the package; if "
+            f"it still differs, please report the processor and the package versions"
+        )
     if benchmark is not None:
         lacking = len(benchmark.content) > len(manifest.content)
         return (

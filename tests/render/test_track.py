@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from dataclasses import replace
 from shutil import rmtree
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.parts import TrackScores
 from fpp_ml_bench.evaluation.score.track import score_track
 from fpp_ml_bench.evaluation.submission.prediction_files import REFUSED_FILE
-from fpp_ml_bench.leaderboard.row_file import in_brief
+from fpp_ml_bench.leaderboard.columns import rigs
+from fpp_ml_bench.leaderboard.row_file import RowTrack, in_brief
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.track import TRACK_LIGHTS, TRACK_VIEWS, track
-from fpp_ml_bench.loaders.storage.benchmark import TRACK
+from fpp_ml_bench.loaders.storage.benchmark import TRACK, benchmark_sentence
 from fpp_ml_bench.loaders.storage.store import DatasetFolder, datasets_below
 
 SUBMISSION = """\
@@ -54,19 +56,19 @@ def test_the_rigs_are_sixteen_that_a_lab_could_own() -> None:
     settings = track()
     assert len(settings) == 16 * len(TRACK_LIGHTS)
     assert list(settings) == list(TRACK.content)
-    rigs = [entry.rig for name, entry in settings.items() if name.endswith("paper")]
-    assert len(set(rigs)) == 16
-    assert [broken_rule(rig) for rig in rigs] == [None] * 16
+    of_paper = [entry.rig for name, entry in settings.items() if name.endswith("paper")]
+    assert len(set(of_paper)) == 16
+    assert [broken_rule(rig) for rig in of_paper] == [None] * 16
     turns = [
         math.degrees(math.atan2(abs(place[1]), abs(place[0])))
-        for place in (-rig.R.T @ rig.t for rig in rigs)
+        for place in (-rig.R.T @ rig.t for rig in of_paper)
     ]
     kinds = Counter("beside" if t < 10 else "above" if t > 80 else "oblique" for t in turns)
     assert kinds == {"beside": 6, "above": 6, "oblique": 4}
-    assert 0.3 <= min(rig.standoff_m for rig in rigs) < 0.45
-    assert 2.0 < max(rig.standoff_m for rig in rigs) <= 2.5
-    assert {rig.camera.width for rig in rigs} >= {640, 1280}
-    assert any(any(rig.camera.distortion) for rig in rigs)
+    assert 0.3 <= min(rig.standoff_m for rig in of_paper) < 0.45
+    assert 2.0 < max(rig.standoff_m for rig in of_paper) <= 2.5
+    assert {rig.camera.width for rig in of_paper} >= {640, 1280}
+    assert any(any(rig.camera.distortion) for rig in of_paper)
     errors = [entry.stated_rig.calibration_px for entry in settings.values()]
     assert min(errors) == 0.1 and max(errors) <= 1 and errors.count(0.1) >= 16
     for name, entry in settings.items():
@@ -147,6 +149,8 @@ def test_from_prediction_to_table_and_row(small, tmp_path, capsys) -> None:
     for said in ("1 frame", "complete already"):
         assert main(["predict", "crossed", str(small), "--out", str(below)]) == 0
         assert said in capsys.readouterr().out
+    assert main(["predict", "crossed", str(small), "--frames", "3", "--out", str(below)]) == 2
+    assert "rig-02-paper" in capsys.readouterr().err
     one = str(below / "rig-02-paper"), str(small / "rig-02-paper")
     assert main_eval([*one, "--target", "depth_exact", "--json", str(result)]) == 0
     words = [str(below), str(small), "--json", str(table), "--into", str(result)]
@@ -157,6 +161,11 @@ def test_from_prediction_to_table_and_row(small, tmp_path, capsys) -> None:
     assert scores["method"] == "crossed" and not scores["refused"]
     brief = in_brief(TrackScores.model_validate(scores))
     assert brief["per_mille"].keys() == scores["datasets"].keys()
+    named = brief | {"benchmark": {"name": TRACK.name, "version": TRACK.version}}
+    row = SimpleNamespace(rigs=RowTrack.model_validate(named | {"refused": ["rig-01-paper"]}))
+    shown = rigs(SimpleNamespace(row=row, all_checked=True))
+    assert shown == f"{brief['per_mille']['rig-02-paper']:.1f} (1 refused)"
+    assert rigs(SimpleNamespace(row=SimpleNamespace(rigs=None), all_checked=True)) == "-"
     assert brief["mean"]["paper"]["per_mille"] == brief["worst_per_mille"]["paper"]
     assert main_eval([*one, "--into", str(result)]) == 2
     assert main_eval([str(below), str(small), "--report", str(tmp_path / "page")]) == 2
@@ -178,3 +187,15 @@ def test_a_method_that_cannot_be_for_a_rig_says_so(small, tmp_path, capsys) -> N
     assert "refused every rig" in capsys.readouterr().err
     assert main(["predict", "no-such-method", str(small), "--out", str(tmp_path / "none")]) == 2
     assert not (tmp_path / "none").exists()
+
+
+def test_a_dataset_of_the_track_with_other_content_is_warned_of(small, monkeypatch) -> None:
+    manifest = DatasetFolder(small / "rig-02-paper").manifest
+    assert benchmark_sentence(manifest)[0]
+    given = track()["rig-02-paper"]
+    stated = replace(
+        manifest, settings=given.describe(), rig=given.stated_rig.to_dict(), stored="first_frames"
+    )
+    as_expected, sentence = benchmark_sentence(stated)
+    assert not as_expected and "rig-02-paper of fpp-bench-rigs version 1" in sentence
+    assert benchmark_sentence(replace(stated, content=TRACK.content["rig-02-paper"]))[0]
