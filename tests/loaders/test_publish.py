@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from conftest import TINY_CONFIGS
 from datasets import Array2D, Features, Image
 from hub_server import Repo
 from huggingface_hub import constants
@@ -124,7 +125,7 @@ def test_load_dataset_reads_the_same_rows_of_every_configuration(
     )
     assert done.returncode == 0, done.stderr
     same_bits(np.load(tmp_path / "streamed.npy"), dataset.frame(dataset.splits["test"][0], 0))
-    assert dataset.configs == ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
+    assert dataset.configs == TINY_CONFIGS
     for config in dataset.configs:
         for split, samples in dataset.splits.items():
             names = config_columns(dataset.sequence, config, exact=True)
