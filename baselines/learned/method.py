@@ -175,7 +175,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
             self.frames_used = frames_of(rig, f"{self.name} --fringes crossed")
             pair = TwoCarriers(rig, own)
             carriers = pair.carriers
-            both = Fringes.of(carriers.step_rad, signs_of(carriers), networks, config.threshold)
+            both = Fringes.of(carriers.step_rad, signs_of(carriers), networks)
             self.route = two_carriers(pair, PairPart(both).before, PairPart.after)
         else:
             other_pitch = pitch_setting(rig, way)
@@ -183,7 +183,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
             phase = model.layer.absolute_phase(model.rig.standoff_m * MM_PER_M)
             step_rad = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)]])
             sign = np.sign(np.median(model.layer.gain))
-            line = Fringes.of(step_rad, np.array([sign]), networks, config.threshold)
+            line = Fringes.of(step_rad, np.array([sign]), networks)
             self.route = one_carrier(model, LinePart(line, model).before, LinePart.after)
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
         more = "" if config.name in shipped_names(SHIPPED) else f" ({config.name})"
@@ -197,7 +197,6 @@ class FringeNetMethod(RouteMethod[Measurement]):
             "weights_sha256": hashes[0]
             if len(hashes) == 1
             else sha256("".join(hashes).encode()).hexdigest(),
-            "mask_threshold": config.threshold,
             "fringes": fringes,
             "members": len(networks),
             **other_pitch,

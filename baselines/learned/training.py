@@ -199,7 +199,6 @@ def train_net(
                     options=network.options,
                     dataset_fingerprint=fingerprint,
                     benchmark=TrainingBenchmark("fringe-net views", 1),
-                    threshold=0.0,
                     steps=recipe.steps,
                     recipe=described,
                     validation={**scores(network, validation)},

@@ -39,7 +39,6 @@ RANGE_HEADS = "range_head."
 """Tensors with this prefix are ignored: files of earlier versions hold them to make mm of
 normalised depth."""
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
 Fingerprint = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -101,10 +100,8 @@ class ModelConfig(TrainedConfig):
 
 @checked_dataclass(frozen=True, config=_STRICT, kw_only=True)
 class NetConfig(TrainedConfig):
-    """A network of fringe-net. ``threshold``: logit from which on a pixel is object; ``steps``
-    trained."""
+    """A network of fringe-net. ``steps`` trained."""
 
-    threshold: Finite
     steps: Count = 0
 
 
