@@ -366,11 +366,13 @@ def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 class Periods:
     """Fringe periods in image px: from ``shortest`` to ``longest`` an image stays as it is; beyond
     it is resampled to a period of ``best``. The defaults are those of the phase route, whose
-    constants were chosen at 22.56 px."""
+    constants were chosen at 22.56 px. On two validation rigs of 32 and 36 px `crossed` has 2.66 per
+    mille of answered pixels resampled, and 2.89 in twice the time as they are; fringe-net has 1.14
+    and 1.13."""
 
     shortest: float = 0.0
     best: float = 22.56
-    longest: float = 2.2 * 22.56
+    longest: float = 1.4 * 22.56
 
 
 @dataclass(frozen=True)

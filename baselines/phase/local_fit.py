@@ -199,8 +199,10 @@ def tied_fit(
         lr, ls = lr + light * by_raised, ls + light * by_slope
     m = window.moment
     power = m(ss)
+    powers = {(a + c, b + d) for a, b in terms for c, d in terms}
+    moments = {(a, b): m(rr, a, b) for a, b in powers}
     rows = [
-        [m(rr, a + c, b + d) for c, d in terms[i:]] + [m(rs, a, b)]
+        [moments[a + c, b + d] for c, d in terms[i:]] + [m(rs, a, b)]
         for i, (a, b) in enumerate(terms)
     ] + [[power]]
     g, *_, s = solve_symmetric(rows, [m(lr, a, b) for a, b in terms] + [m(ls)])
