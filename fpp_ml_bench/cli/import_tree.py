@@ -17,6 +17,7 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import capture_notes, plan_captures
 from fpp_ml_bench.loaders.captures.images import read_splits
+from fpp_ml_bench.loaders.captures.real import plan_real, read_set, real_notes, set_names
 from fpp_ml_bench.loaders.published.importing import (
     AGREEING_MM,
     RowReader,
@@ -95,6 +96,12 @@ class ImportSettings(HubSettings, CaptureSettings):
     workers: int | None = option(
         None, "processes (default: one per processor)", "N", parse=AT_LEAST_ONE
     )
+    real: str | None = option(
+        None,
+        f"TREE is a copy of the repository of a set of real captures: {', '.join(set_names())}, "
+        f"or a YAML file that describes another",
+        "NAME",
+    )
     captures: bool = option(False, "TREE holds captures, which --rig decodes into the ground truth")
     rig: Path | None = option(
         None, "rig that took the images, YAML or JSON (default: the paper's, scaled)", "FILE"
@@ -120,6 +127,7 @@ fpp-bench import fpp-ml-bench --out data/published --frame-order paper
 fpp-bench import my-scans --out data/mine --rig my-rig.yaml
 fpp-bench import my-scans --out data/mine --fit-rig         find the rig from frames and depth, as calibrate does
 fpp-bench import my-captures --captures --out data/mine --rig my-rig.yaml --splits splits.yaml
+fpp-bench import SLMaster --real slmaster --out data/real-slmaster        a clone of that repository
 
 TREE holds training_datasets/ (training_data_depth_raw, or the global or individual variant) and, if there are
 raw scans, fpp_synthetic_dataset/. The tree's split is used. If files break the layout, they are all listed and
@@ -154,10 +162,29 @@ def import_tree(settings: ImportSettings) -> None:
         raise BuildError(
             "--rig and --fit-rig: the first gives the rig that the second finds; give one of them"
         )
-    if settings.captures:
+    if settings.real is not None:
+        _import_real(settings)
+    elif settings.captures:
         _import_captures(settings)
     else:
         _import_tree(settings, bool(from_hub))
+
+
+def _import_real(settings: ImportSettings) -> None:
+    fixed = [*given(settings, CaptureSettings), *given(settings, HubSettings)]
+    fixed += ["--rig"] * (settings.rig is not None) + ["--captures"] * settings.captures
+    fixed += ["--fit-rig"] * settings.fit_rig + ["--nodata"] * (settings.nodata is not None)
+    if settings.frame_order != "auto":
+        fixed.append("--frame-order")
+    if fixed:
+        raise BuildError(
+            f"--real: {fixed[0]} can't be changed, because the set's own file says it; leave it out"
+        )
+    read = read_set(str(settings.real))
+    manifest, seconds = _written(settings, plan_real(read, settings.tree))
+    _print_captures(manifest)
+    notes = real_notes(read, manifest.settings) + capture_notes(manifest)
+    _print_end(settings.out, manifest, seconds, notes)
 
 
 def _import_captures(settings: ImportSettings) -> None:

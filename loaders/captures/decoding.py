@@ -7,9 +7,10 @@ the same crash-safe assembly as a build. What the rig can't decode is background
 """
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -242,7 +243,7 @@ class CaptureReader(RowReader):
     limits: Limits
     bits: int | None
     colour: str | None
-    anyway: bool = False
+    anyway: frozenset[str] = frozenset()
 
     def refusal(self, problems: list[str]) -> CaptureError:
         return CaptureError("\n  ".join(problems))
@@ -254,7 +255,7 @@ class CaptureReader(RowReader):
         captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
         try:
             decoded, examination = _examined_and_decoded(
-                captured, self.rig, self.limits, self.anyway
+                captured, self.rig, self.limits, capture.sample in self.anyway
             )
         except DecodeError as error:
             raise CaptureError(f"{capture.folder}: {error}") from error
@@ -312,13 +313,29 @@ def plan_captures(
     check_limits(limits := limits or Limits())
     captures = find_captures(root, len(rig.sequence))
     by_split = split_captures(captures, splits)
+    settings = {"layout": "captures", "splits": "all in test" if splits is None else "given"}
+    refused = frozenset(capture.sample for capture in captures) if anyway else frozenset()
+    return captures_plan(captures, by_split, rig, limits, bits, colour, refused, settings)
+
+
+def captures_plan(
+    captures: Sequence[Capture],
+    by_split: Mapping[str, Sequence[Capture]],
+    rig: Rig,
+    limits: Limits,
+    bits: int | None,
+    colour: str | None,
+    anyway: frozenset[str],
+    settings: dict[str, Any],
+) -> Assembly[CaptureReader]:
+    """The dataset of ``captures`` in the splits ``by_split``; ``anyway``: samples that are read
+    although the examination refuses them; ``settings``: of the manifest, beside the decoder's."""
     pixels = rig.camera.height * rig.camera.width
     plans: list[ShardPlan] = []
     for split, chosen in by_split.items():
         plans += plan_rows(split, [(c.sample, c.object, c.view) for c in chosen], pixels)
     settings = {
-        "layout": "captures",
-        "splits": "all in test" if splits is None else "given",
+        **settings,
         **asdict(limits),
         "bits": bits,
         "colour": colour,

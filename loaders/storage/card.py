@@ -49,6 +49,11 @@ _LIMITS = {
 - All images are of one rig, whose working range is {near:g} to {far:g} mm.
 """,
 }
+_REAL_LIMITS = """\
+- The frames are real captures from {source}. `depth` is decoded from all of them with the rig in `rig.yaml`, and has
+  the errors of both. Pixels that are not decoded have no truth, and count in no score.
+- All images are of one rig, whose working range is {near:g} to {far:g} mm.
+"""
 _IMPORTED_LIMITS = """\
 - `depth` is that of the imported files{source}; there is no exact depth, and no flags of unlit or mixed pixels.
 - The files do not name their rig: `rig.yaml` is {rig}.
@@ -158,7 +163,11 @@ def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> 
     if "repository" in settings:
         url = f"https://huggingface.co/datasets/{settings['repository']}"
         source = f", from {url} at commit `{settings['commit']}`"
-    limits = _LIMITS.get(manifest.origin, _IMPORTED_LIMITS).format(
+    text = _LIMITS.get(manifest.origin, _IMPORTED_LIMITS)
+    if real := settings.get("set"):
+        text = _REAL_LIMITS + "".join(f"- {line}.\n" for line in real["known"])
+        source = f"{real['source']} at commit `{real['commit']}` (licence: {real['licence']})"
+    limits = text.format(
         light=settings.get("light", {}).get("name", "paper"),
         near=near,
         far=far,

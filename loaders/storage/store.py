@@ -229,9 +229,11 @@ class DatasetFolder:
 
     def void(self, sample: str, column: str = DEPTH) -> NDArray[np.bool_]:
         """Pixels that count in no score against ``column``, bool (H, W): of ``depth_exact``
-        `exact_void`, of ``depth`` `void_pixels`, with surface that has no decoded depth. None are
-        in data without flags."""
+        `exact_void`, of ``depth`` `void_pixels`, with surface that has no decoded depth. In data
+        without flags all that is not decoded of a real set (`captures.real`), else none."""
         if not self.has_exact:
+            if self.manifest.settings.get("undecoded") == "void":
+                return self.depth_mm(sample) == 0
             return np.zeros(self.size, dtype=bool)
         if column == DEPTH_EXACT:
             return exact_void(self.flags(sample))
