@@ -159,6 +159,15 @@ class CalibrationLayer:
             torch.tensor(m, dtype=dtype or torch.float32, device=device) for m in self.maps
         )
 
+    def shifted(self, shift_rad: float) -> "CalibrationLayer":
+        """The layer of fringes that are shifted by ``shift_rad`` (NumPy only)."""
+        if not shift_rad:
+            return self
+        infinity = self.infinity_rad + shift_rad
+        turns = np.floor(infinity / TAU + 0.5)
+        maps = (infinity - TAU * turns, self.infinity_order + turns, *self.maps[2:])
+        return self.with_maps(maps)
+
     def residual_phase(self, phase_rad: Any, order: Any) -> Any:
         """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are
         subtracted, then whole periods counted, so that float32 keeps its digits."""

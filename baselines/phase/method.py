@@ -347,22 +347,14 @@ def crossed_name(submission: "Submission", begins: str) -> str | None:
 
 def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
     """``options`` of a method called ``name`` that computes with the fringes of one direction, by
-    default the rig's only one. Raises `PredictionError` for fringes that it would take for
-    others."""
+    default the rig's only one. Raises `PredictionError` for an option that its code does not
+    allow."""
     ways = rig.fringe_directions
     if len(ways) == 1:
         options = {"direction": ways[0], **options}
     direction = options.get("direction", "horizontal")
     if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
         return options  # refused by the method
-    shifts = code.fringes[code.finest].shifts_deg
-    if code.origin_px != 0 or shifts[0] != 0:
-        raise PredictionError(
-            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the "
-            f"first {direction} "
-            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); decode all "
-            f"frames instead"
-        )
     if options.get("error_mm") is not None and not code.is_plain:
         raise PredictionError(
             f"{name}: error_mm needs fringes of one period with Gray code in half periods, and "

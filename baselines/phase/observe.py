@@ -268,7 +268,8 @@ class MeasurementModel:
 
 
 class OneCarrier(MeasurementModel):
-    """Fringes of one direction, ``settings.frames`` of them (`steps_of`)."""
+    """Fringes of one direction, ``settings.frames`` of them (`steps_of`). Phases are those of the
+    first of them."""
 
     def __init__(
         self, rig: Rig, settings: Settings | None = None, periods: Periods | None = None
@@ -277,13 +278,14 @@ class OneCarrier(MeasurementModel):
         rig.check_sampling()
         shifts_rad = rig.shifts_rad(settings.direction)
         self.steps = steps_of(len(shifts_rad), settings.frames)
-        self.shifts_rad = tuple(shifts_rad[step] for step in self.steps)
+        self.first_rad = first = shifts_rad[self.steps[0]]
+        self.shifts_rad = tuple(shifts_rad[step] - first for step in self.steps)
         frames = len(self.steps), f"fringes, those of steps {self.steps}"
         super().__init__(
             rig, settings, rig.image_px_per_period(settings.direction), periods, frames
         )
         rig = self.rig
-        self.layer = CalibrationLayer.of(rig, settings.direction)
+        self.layer = CalibrationLayer.of(rig, settings.direction).shifted(first)
         (near, far), periods_in_range = (
             rig.working_range_mm,
             rig.periods_in_range(settings.direction),
@@ -307,7 +309,8 @@ class OneCarrier(MeasurementModel):
     @cached_property
     def captured_layer(self) -> CalibrationLayer:
         """The calibration layer of the captured images."""
-        return CalibrationLayer.of(self.resampling.captured, self.settings.direction)
+        captured = self.resampling.captured
+        return CalibrationLayer.of(captured, self.settings.direction).shifted(self.first_rad)
 
     def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
         """Mask and phase of captured fringes: one, uint8 (H, W), or the frames of ``steps``.

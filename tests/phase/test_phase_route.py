@@ -34,6 +34,7 @@ from fpp_ml_bench.evaluation.submission.description import read_submission
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 SIZE = RIG.camera.width
 ANGLE = np.deg2rad(5.0)
@@ -75,6 +76,25 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
         assert (
             given.mean() > 0.9999 and (measurement.reason[lit][~given] == Reason.OUT_OF_RANGE).all()
         )
+
+
+@pytest.mark.parametrize("pitch_px", [18, 44])
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_fringes_with_a_crest_anywhere(frames: int, pitch_px: float) -> None:
+    """Steps in another order, and an origin that is not pixel 0, tell the same depth."""
+    for shifts in ({"shifts_deg": [0, 120, 240]}, {"shifts_deg": [90, 210, 330], "origin_px": 7}):
+        code = {"scheme": "phase-shift", "pitch_px": pitch_px, **shifts}
+        entries = {key: value for key, value in RIG.to_dict().items() if key != "pitch_px"}
+        rig = rig_from_dict({**entries, "sequence": {"order": ["vertical"], "vertical": code}})
+        exact_m = plane_depth_m(rig, 1.75, (0.1, 0.05))
+        method = PhaseMethod(rig, direction="vertical", frames=frames, **USERS_WORD)
+        images: list[Any] = [None] * len(rig.sequence)
+        for number in method.frames_used:
+            images[number] = plane_fringe(rig, number, exact_m, (0.1, 0.05))
+        measurement = method.measure(images)
+        lit = measurement.modulation_grey > 5
+        assert lit.mean() > 0.7
+        assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
