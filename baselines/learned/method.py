@@ -186,6 +186,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
             line = Fringes.of(step_rad, np.array([sign]), networks)
             self.route = one_carrier(model, LinePart(line, model).before, LinePart.after)
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
+            self.caution = model.caution
         more = "" if config.name in shipped_names(SHIPPED) else f" ({config.name})"
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
         frame = f"one {fringes} frame{pitch_words(other_pitch)}"

@@ -176,6 +176,7 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
             f"Phase route, {count}{pitch_words(other_pitch)}, order by {cues}, nothing learned"
         )
         self.settings = asdict(settings) | self.use_mask(given.mask) | other_pitch
+        self.caution = model.caution
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:

@@ -98,6 +98,19 @@ def test_fringes_with_a_crest_anywhere(frames: int, pitch_px: float) -> None:
         assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
 
 
+def test_an_order_that_nothing_tells_is_said_before() -> None:
+    """Of a rig whose range holds more than one period, and that shows no plane of known depth."""
+    unknown = replace(RIG, background_m=None)
+    said = PhaseMethod(unknown).caution
+    assert "1500 to 2100 mm holds" in said and "periods of the horizontal fringes" in said
+    assert "no background_m" in said and "--white-grey" in said
+    for rig, options in ((RIG, {}), (unknown, {"white_grey": 200.0})):
+        assert PhaseMethod(rig, **options).caution == ""
+    near, far = RIG.working_range_mm
+    period_mm = (far - near) / RIG.periods_in_range("horizontal")
+    assert PhaseMethod(unknown.with_range((1700.0, 1700 + period_mm / 2))).caution == ""
+
+
 @pytest.mark.parametrize("frames", [1, 2, 3])
 @pytest.mark.parametrize(
     "rig", [RIG, replace(RIG, pitch_horizontal_px=90.0)], ids=["captured", "resampled"]
