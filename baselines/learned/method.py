@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.method import Assumption, Frames
 from fpp_ml_bench.baselines.phase.depth import Measurement
 from fpp_ml_bench.baselines.phase.method import (
+    AUDIT,
     RANGE_AND_WALL,
     RouteMethod,
     crossed_image,
@@ -56,6 +57,7 @@ class FringeNetOptions:
         "weights file of fpp-bench train (default: the weights that come with the package)",
         "FILE",
     )
+    audit: bool = option(False, AUDIT)
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     threads: int = 1
 
@@ -171,12 +173,16 @@ class FringeNetMethod(RouteMethod[Measurement]):
         self.rig, self.threads = rig, given.threads
         own = Settings(min_confidence=given.min_confidence)
         other_pitch: dict[str, float] = {}
+        audited: dict[str, bool] = {}
+        if given.audit and not crossed:
+            raise PredictionError(f"{self.name} --audit needs a frame of two carriers")
         if crossed:
             self.frames_used = frames_of(rig, f"{self.name} --fringes crossed")
             pair = TwoCarriers(rig, own)
             carriers = pair.carriers
             both = Fringes.of(carriers.step_rad, signs_of(carriers), networks)
-            self.route = two_carriers(pair, PairPart(both).before, PairPart.after)
+            self.route = route = two_carriers(pair, PairPart(both).before, PairPart.after)
+            audited = self.use_audit(route, given.audit)
         else:
             other_pitch = pitch_setting(rig, way)
             model = OneCarrier(rig, Settings(way, min_confidence=given.min_confidence))
@@ -193,7 +199,8 @@ class FringeNetMethod(RouteMethod[Measurement]):
         self.title = f"Wrapped phase and mask of {frame} by {count}; order measured{more}"
         hashes = [file.sha256 for file in files]
         self.settings = {
-            **vars(given),
+            **{key: value for key, value in vars(given).items() if key != "audit"},
+            **audited,
             "weights": config.name,
             "weights_sha256": hashes[0]
             if len(hashes) == 1
