@@ -37,17 +37,22 @@ SCALES_PX = np.concatenate([[1e-4], np.geomspace(0.02, 10, 11)])
 """Sizes of a change that are considered, in projector px (RMS over the points); the first is none,
 and as probable as all others together."""
 SURE_CHANCE = 0.3
-"""Chance of a wrong order above which a pixel says nothing of the calibration."""
-FEWEST_POINTS = 60
-"""Points, a period apart, below which nothing is said."""
-ALIKE = 4.0
-"""Points beside each other share their errors: so many count as one."""
+"""Chance of a wrong order up to which a pixel says something of the calibration, and the surer half
+of the object in any case."""
+POINTS_PER_PERIOD = 4
+"""Points that are looked at, along each axis."""
+FEWEST_POINTS = 300
+"""Points below which nothing is said: those of 19 square periods."""
+ALIKE = 4.0 * POINTS_PER_PERIOD**2
+"""Points beside each other share their errors: those of four square periods count as one."""
 FLOOR_PX = 0.05
 """Error of the phases that looks like a change, in projector px: the largest pattern that a right
 calibration left on validation views."""
 CERTAIN = 2.0
 """A change is corrected from so many standard uncertainties, so that a right calibration stays as it
 is."""
+ROUNDS = 6
+"""Fits in a row, each without the points that the one before does not explain."""
 FURTHEST = 4.0
 """Residual, in robust standard deviations, beyond which a point is left out."""
 
@@ -131,9 +136,10 @@ class _Changes:
 def _audited(fitted: Fitted) -> tuple[Audit, _Changes | None]:
     """What the two phases say, and what follows; nothing of a frame with too few sure pixels."""
     seen, nearness, carriers = fitted.seen, fitted.fit.nearness, fitted.seen.carriers
-    step = max(1, round(seen.period_px))
-    sure = seen.inside & (fitted.wrong_chance < SURE_CHANCE)
-    sure = cv2.erode(sure.astype(np.uint8), disk(step / 2)) > 0
+    step = max(1, round(seen.period_px / POINTS_PER_PERIOD))
+    chance = fitted.wrong_chance
+    sure = seen.inside & (chance <= max(SURE_CHANCE, np.median(chance[seen.inside])))
+    sure = cv2.erode(sure.astype(np.uint8), disk(step)) > 0
     used = np.zeros_like(sure)
     used[step // 2 :: step, step // 2 :: step] = sure[step // 2 :: step, step // 2 :: step]
     if np.count_nonzero(used) < FEWEST_POINTS:
@@ -149,9 +155,7 @@ def _audited(fitted: Fitted) -> tuple[Audit, _Changes | None]:
     changes = changes * unit[:, None, None, None]
     across = (ahead[0] * changes[:, 1] - ahead[1] * changes[:, 0])[:, used].T
     off = (ahead[0] * off_px[1] - ahead[1] * off_px[0])[used]
-    noise_px = _noise_px(off, across)
-    kept = np.abs(off - across @ _least(across, off)) < FURTHEST * noise_px
-    across, off = across[kept], off[kept]
+    across, off, noise_px = _without_outliers(across, off)
     mean, covariance = _posterior(across, off, noise_px)
     certain = np.abs(mean) > CERTAIN * np.sqrt(np.diag(covariance))
     corrected = np.where(certain & (np.arange(len(mean)) >= CORRECTED), mean, 0.0)
@@ -187,14 +191,19 @@ def _changes_px(fitted: Fitted) -> NDArray[np.float64]:
     return np.array(terms) * focal[:, None, None]
 
 
-def _least(slopes: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.linalg.lstsq(slopes, values, rcond=1e-3)[0]  # type: ignore[no-any-return]
-
-
-def _noise_px(values: NDArray[np.float64], slopes: NDArray[np.float64]) -> float:
-    """Robust standard deviation of what no change explains, never 0."""
-    left = values - slopes @ _least(slopes, values)
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(left))), 1e-3)
+def _without_outliers(
+    slopes: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """The points that changes explain (n, P) and (n,), and the robust standard deviation of what is
+    left, never 0: those of wrong orders are anywhere."""
+    left = values - np.median(values)
+    for _ in range(ROUNDS):
+        noise_px = max(MAD_TO_SIGMA * float(np.median(np.abs(left))), 1e-3)
+        kept = np.abs(left) < FURTHEST * noise_px
+        change = np.linalg.lstsq(slopes[kept], values[kept], rcond=1e-3)[0]
+        left = values - slopes @ change
+    noise_px = max(MAD_TO_SIGMA * float(np.median(np.abs(left[kept]))), 1e-3)
+    return slopes[kept], values[kept], noise_px
 
 
 def _posterior(

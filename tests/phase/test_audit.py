@@ -83,7 +83,7 @@ def test_what_lies_along_the_lines_is_not_seen_and_stated() -> None:
     measured, audit = measure_audited(route(), image)
     after, sigma_mm = errors_mm(measured, depth_mm)
     assert np.median(after) == pytest.approx(np.median(before), rel=0.05)
-    assert np.median(sigma_mm) > 1.5 * np.median(plain_mm)
+    assert np.median(sigma_mm) > 1.2 * np.median(plain_mm)
     assert (after < 1.96 * sigma_mm).mean() > 0.9
     assert audit.along_px > 0.3
 
