@@ -163,7 +163,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         fringes = "crossed" if crossed else way
         if not 1 <= given.members <= MEMBERS:
             raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
-        names = [given.weights] if given.weights else [f"{self.name}-{s}" for s in SEEDS]
+        names = [given.weights] if given.weights else [f"{FringeNetMethod.name}-{s}" for s in SEEDS]
         files = [
             one if isinstance(one, WeightsFile) else load_net(one) for one in names[: given.members]
         ]
