@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.training.weights import NetConfig, WeightsFile
     from fpp_ml_bench.evaluation.submission.description import Submission
 
-SEEDS = (42,)
-"""Of the networks that come with the package."""
-MEMBERS = len(SEEDS)
+NETWORKS = ("fringe-net-42",)
+"""Weights of the networks that come with the package."""
+MEMBERS = len(NETWORKS)
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         fringes = "crossed" if crossed else way
         if not 1 <= given.members <= MEMBERS:
             raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
-        names = [given.weights] if given.weights else [f"{FringeNetMethod.name}-{s}" for s in SEEDS]
+        names = [given.weights] if given.weights else list(NETWORKS)
         files = [
             one if isinstance(one, WeightsFile) else load_net(one) for one in names[: given.members]
         ]
