@@ -136,6 +136,8 @@ class _Changes:
 def _audited(fitted: Fitted) -> tuple[Audit, _Changes | None]:
     """What the two phases say, and what follows; nothing of a frame with too few sure pixels."""
     seen, nearness, carriers = fitted.seen, fitted.fit.nearness, fitted.seen.carriers
+    if not seen.inside.any():
+        return NOTHING, None
     step = max(1, round(seen.period_px / POINTS_PER_PERIOD))
     chance = fitted.wrong_chance
     sure = seen.inside & (chance <= max(SURE_CHANCE, np.median(chance[seen.inside])))
