@@ -140,7 +140,7 @@ def _audited(fitted: Fitted) -> tuple[Audit, _Changes | None]:
         return NOTHING, None
     step = max(1, round(seen.period_px / POINTS_PER_PERIOD))
     chance = fitted.wrong_chance
-    sure = seen.inside & (chance <= max(SURE_CHANCE, np.median(chance[seen.inside])))
+    sure = seen.inside & (chance <= max(SURE_CHANCE, float(np.median(chance[seen.inside]))))
     sure = cv2.erode(sure.astype(np.uint8), disk(step)) > 0
     used = np.zeros_like(sure)
     used[step // 2 :: step, step // 2 :: step] = sure[step // 2 :: step, step // 2 :: step]
