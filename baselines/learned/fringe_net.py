@@ -47,6 +47,13 @@ a wall that the empty scene explains badly. On validation views before the paper
 the measured mask misses 0.002% and invents 0.48% of the object, the networks alone 0.18% and 0.68%,
 both 0.02% and 0.49%; on four drawn rigs in `workshop` 0.39% and 11.9%, 0.50% and 1.13%, 0.16% and
 2.0%. A missed pixel costs six times an invented one in the object's MAE."""
+AVERAGE_PERIODS, AVERAGE_RAD = 0.2, 0.3
+"""Sigmas over which the phase is averaged once its order is chosen (bilateral filter): across the
+image in periods of the longer carrier, and between phases, so that surfaces apart stay apart. What a
+network is off by differs from pixel to pixel. Error of answered object pixels of one network,
+crossed, validation views, without and with it: paper's rig 0.68 and 0.61 per mille in `paper`, 1.15
+and 1.03 in `workshop`; four drawn rigs 0.87 and 0.85, 1.69 and 1.62. Twice as far between phases or
+1.5 times across the image: the same within 0.02."""
 EXPECTED_SHARE = float(np.sqrt(2 / np.pi))
 """Expected size of a normal error, in standard deviations."""
 
@@ -214,8 +221,21 @@ class LinePart:
             return chosen
         phase_rad, sigma_rad = seen.other_phase
         order = chosen.order + np.rint((seen.phase_rad - phase_rad) / TAU).astype(np.int32)
+        residual_rad = seen.layer.residual_phase(phase_rad, order)
+        moved = phase_rad + averaged(residual_rad, seen.inside, seen.period_px) - residual_rad
+        phase_rad = wrapped(moved).astype(np.float32)
+        order = order + np.rint((moved - phase_rad) / TAU).astype(np.int32)
         measured = replace(seen, phase_rad=phase_rad, uncertainty_rad=sigma_rad)
         return FringeOrder(measured, order, chosen.margin)
+
+
+def averaged(phase_rad: NDArray, inside: Mask, period_px: float) -> Image:
+    """Absolute phases float32 (h, w), in rad, those of pixels ``inside`` averaged over such pixels
+    around whose phase is alike (`AVERAGE_PERIODS`, `AVERAGE_RAD`)."""
+    far = float(phase_rad[inside].max(initial=0)) + 10 * AVERAGE_RAD
+    known = np.where(inside, phase_rad, far).astype(np.float32)
+    around = cv2.bilateralFilter(known, -1, AVERAGE_RAD, AVERAGE_PERIODS * period_px)
+    return np.where(inside, around, phase_rad).astype(np.float32)
 
 
 def _nearness_fit(seen: CrossedObservation, fit: NearnessFit, sigma_rad: Image) -> NearnessFit:
@@ -223,6 +243,8 @@ def _nearness_fit(seen: CrossedObservation, fit: NearnessFit, sigma_rad: Image) 
     carriers = seen.carriers
     beside = wrapped(seen.phase_rad - carriers.phases(fit.nearness))
     nearness = fit.nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2
+    unit_rad = float(np.median(carriers.joint_gain))
+    nearness = averaged(nearness * unit_rad, seen.inside, seen.period_px) / unit_rad
     misfit = (
         seen.light - np.maximum(fit.brightness, 0) * fringes(carriers, nearness, seen.contrast)[0]
     )
