@@ -141,7 +141,8 @@ class Method:
     `evaluation.submission.LearnedFrom` has it; a class outside this package says so itself, like
     ``learned_from = {"data": "other", "versions": ["my scans"]}``, and without that it is unknown.
     code: hashes of the files of a class outside this package. batched: whether `predict_batch`
-    takes all samples at once. reports: whether `answer` reports.
+    takes all samples at once. reports: whether `answer` reports. caution: a sentence that a user
+    should read before it runs.
     """
 
     name: str
@@ -168,6 +169,7 @@ class Method:
     code: Mapping[str, str] = MappingProxyType({})
     batched: bool = False
     reports: bool = False
+    caution: str = ""
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         """For images of ``rig``; ``options`` are the fields of `Options`, and become the settings

@@ -18,10 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
+from fpp_ml_bench.baselines.phase.audit import measure_audited
 from fpp_ml_bench.baselines.phase.depth import FringeMeasurement, Measurement, Reason
-from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES, OneCarrier, TwoCarriers
+from fpp_ml_bench.baselines.phase.observe import (
+    CROSSED_FRAMES,
+    OneCarrier,
+    TwoCarriers,
+)
 from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
-from fpp_ml_bench.baselines.phase.route import AnyRoute, Measured, one_carrier, two_carriers
+from fpp_ml_bench.baselines.phase.route import (
+    AnyRoute,
+    CrossedRoute,
+    Measured,
+    one_carrier,
+    two_carriers,
+)
 from fpp_ml_bench.baselines.phase.settings import MIN_CONFIDENCE, PIXELWISE, Settings, steps_of
 from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.coding.phase_shift import PhaseShift
@@ -79,11 +90,19 @@ class PhaseOptions(Settings):
     mask: str | Path | None = option(None, MASK, "FILE")
 
 
+AUDIT = (
+    "correct roll and zoom of the projector by what both phases tell across the epipolar lines, "
+    "and report it"
+)
+"""Help of ``--audit``."""
+
+
 @dataclass(frozen=True)
 class CrossedOptions:
     """Options of `CrossedMethod`."""
 
     frames: int = option(1, "crossed frames, 1 or 3 (default: 1)", "N")
+    audit: bool = option(False, AUDIT)
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     mask: str | Path | None = option(None, MASK, "FILE")
 
@@ -94,6 +113,8 @@ class RouteMethod(Method, Generic[Measured]):
 
     route: AnyRoute[Measured]
     mask: NDArray[np.bool_] | None = None
+    audited: CrossedRoute | None = None
+    """The route, where the calibration is to be audited."""
 
     def use_mask(self, mask: str | Path | None) -> dict[str, str]:
         """Take the object mask of every sample from a file (`captures.read_mask`), if there is one;
@@ -122,8 +143,18 @@ class RouteMethod(Method, Generic[Measured]):
     def answer(self, frames: Frames) -> Answer:
         """Depth, 0 = background, or masked where ``min_confidence`` is above 0, and its standard
         uncertainty."""
-        measurement = self.measure(frames)
-        return Answer(measurement.depth_mm, measurement.sigma_mm)
+        if self.audited is None:
+            measurement: Measurement = self.measure(frames)
+            return Answer(measurement.depth_mm, measurement.sigma_mm)
+        measurement, audit = measure_audited(self.audited, self.images(frames), self.mask)
+        return Answer(measurement.depth_mm, measurement.sigma_mm, audit.report())
+
+    def use_audit(self, route: CrossedRoute, wanted: bool) -> dict[str, bool]:
+        """Audit the calibration with every sample, if ``wanted``; what it adds to the settings."""
+        if not wanted:
+            return {}
+        self.audited, self.reports = route, True
+        return {"audit": True}
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
         seen = self.route.observe(self.images(frames), self.mask)
@@ -171,6 +202,7 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
             f"Phase route, {count}{pitch_words(other_pitch)}, order by {cues}, nothing learned"
         )
         self.settings = asdict(settings) | self.use_mask(given.mask) | other_pitch
+        self.caution = model.caution
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -309,11 +341,12 @@ class CrossedMethod(RouteMethod[Measurement]):
                 f"{self.name} --frames {frames}: expected 1 or {CROSSED_FRAMES} crossed frames"
             )
         model = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), moved=moved)
-        self.route = two_carriers(model)
+        self.route = route = two_carriers(model)
         pitches = " and ".join(f"{pitch:g}" for pitch in model.family.pitches_px)
         self.title = f"Crossed fringes of {pitches} px, {count}, nothing learned"
         self.settings = {"min_confidence": given.min_confidence} | self.use_mask(given.mask)
         self.settings |= {} if frames == 1 else {"frames": frames}
+        self.settings |= self.use_audit(route, given.audit)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:

@@ -312,6 +312,22 @@ class OneCarrier(MeasurementModel):
         captured = self.resampling.captured
         return CalibrationLayer.of(captured, self.settings.direction).shifted(self.first_rad)
 
+    @property
+    def caution(self) -> str:
+        """What a user should know before anything is measured, "" where nothing is."""
+        rig, direction = self.resampling.captured, self.settings.direction
+        periods = rig.periods_in_range(direction)
+        calibrated = rig.background_m is not None or self.settings.white_grey is not None
+        if periods <= 1 or calibrated:
+            return ""
+        near, far = rig.working_range_mm
+        return (
+            f"the working range {near:g} to {far:g} mm holds {periods:.2g} periods of the "
+            f"{direction} fringes, and nothing calibrates brightness (the rig has no background_m, "
+            f"and no --white-grey is given): where range and continuity leave two orders, a pixel "
+            f"stays without a depth. Narrow working_range_mm to one period, or use crossed fringes"
+        )
+
     def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
         """Mask and phase of captured fringes: one, uint8 (H, W), or the frames of ``steps``.
         ``mask`` bool (H, W) replaces the object mask that is found. Raises `DecodeError` for

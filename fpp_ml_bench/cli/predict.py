@@ -1,6 +1,7 @@
 """``fpp-bench predict`` and ``fpp-bench time``: run a method over a split, and measure what it
 costs."""
 
+import sys
 from pathlib import Path
 
 from rich.table import Table
@@ -62,6 +63,8 @@ def predict(
         return
     opened = DatasetFolder(dataset)
     method = chosen.load(opened)
+    if method.caution:
+        print(f"{chosen.name}: {method.caution}", file=sys.stderr)
     opened = opened.without_truth()  # the method can look at its caller
     samples = len(opened.samples(split))
     bar = progress_bar(f"{chosen.name}, {split}", samples, "samples", shown=False)
