@@ -33,7 +33,6 @@ from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.evaluation.submission.description import read_submission
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.scene import BuildSettings
-from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
@@ -341,16 +340,17 @@ def test_the_users_word_from_the_command_line(
     dataset = str(tmp_path / "set")
     build(Path(dataset), BuildSettings(RIG, ("cork",), stored="single_shot"), workers=1)
     word = ["--white-grey", "180", "--ambient-grey", "0"]
-    out = tmp_path / "phase"
-    assert main(["predict", "phase", dataset, "--out", str(out), "--split", "all", *word]) == 0
-    settings = read_submission(out).settings
-    assert (settings["white_grey"], settings["ambient_grey"]) == (180.0, 0.0)
+    for method in ("phase", "phase-net"):
+        out = tmp_path / method
+        assert main(["predict", method, dataset, "--out", str(out), "--split", "all", *word]) == 0
+        settings = read_submission(out).settings
+        assert (settings["white_grey"], settings["ambient_grey"]) == (180.0, 0.0)
     for arguments, message in (
         (["phase", dataset, "--white-grey", "-1"], "white_grey -1.0: expected more than 0"),
-        (["phase", dataset, "--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
+        (["phase-net", dataset, "--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
         (
             ["classical", dataset, "--ambient-grey", "6"],
-            "--ambient-grey is an option of phase, not of classical",
+            "--ambient-grey is an option of phase, phase-net, not of classical",
         ),
     ):
         capsys.readouterr()
@@ -380,13 +380,3 @@ def test_refusals_name_what_came() -> None:
     ):
         with pytest.raises(PredictionError, match=next(iter(wrong))):
             PhaseMethod(RIG, **wrong)
-
-
-def test_fringes_along_the_baseline_are_refused() -> None:
-    beside = replace(paper_rig(224), translation_m=(0.16, 0.0, 0.0))
-    with pytest.raises(PredictionError, match="horizontal fringes tell no depth on this rig"):
-        load_method("phase", beside, direction="horizontal")
-    with pytest.raises(PredictionError, match="use the other direction"):
-        load_method("fringe-net", beside, fringes="horizontal")
-    for method in ("phase", "fringe-net"):
-        assert load_method(method, beside).frames_used == (18,)
