@@ -1,5 +1,5 @@
 """Real captures that others published, as datasets: each set is described by a YAML file in ``sets/``
-or of the user's own, and read from the user's copy of the repository that holds it.
+or of the user's own, and read from the user's copy of the repository that holds it::
 
     title: Plaster relief of an eye, one camera
     source: https://github.com/Practice3DVision/SLMaster
