@@ -70,6 +70,8 @@ def test_a_real_set_is_a_dataset_whose_undecoded_pixels_count_nowhere(copied, ca
     assert metrics["two_sided_mae_mm"] == pytest.approx(error_mm, rel=1e-4)
     assert metrics["background_mae_mm"] is None and metrics["invented_share"] == 0
     assert "without background" in capsys.readouterr().out
+    assert run("leaderboard", result) == 0
+    assert "Real light, plane, " in capsys.readouterr().out
 
 
 def test_files_of_another_commit_are_named(copied, capsys):
