@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import Method, checked
+from fpp_ml_bench.baselines.method import Answer, Frames, Method, checked
 from fpp_ml_bench.depth import object_mask
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.evaluation.submission.description import check_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import (
     REPORTS_FILE,
@@ -77,10 +77,10 @@ def predict_split(
             if not run.holds(sample, path, opened.size):
                 frames = captured_frames(opened, method, sample)
                 if not warm:
-                    method.answer(frames)
+                    _answer(method, frames, sample)
                     warm = True
                 started = perf_counter()
-                answer = method.answer(frames)
+                answer = _answer(method, frames, sample)
                 seconds = perf_counter() - started
                 checked(answer, opened.size, path)
                 run.begin()
@@ -176,6 +176,13 @@ class UnfinishedRun:
             file.write(json.dumps(entry) + "\n")
             file.flush()
             os.fsync(file.fileno())
+
+
+def _answer(method: Method, frames: Frames, sample: str) -> Answer:
+    try:
+        return method.answer(frames)
+    except DecodeError as error:
+        raise PredictionError(f"{sample}: {error}") from error
 
 
 def _flat(run: Mapping[str, Any]) -> dict[str, Any]:

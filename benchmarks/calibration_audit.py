@@ -2,9 +2,11 @@
 
     python benchmarks/calibration_audit.py crossed --draws 40
     python benchmarks/calibration_audit.py fringe-net --draws 40
+    python benchmarks/calibration_audit.py crossed --draws 12 --sizes 4 --light workshop
 
 For every kind and size of change: mean absolute error in mm of answered object pixels without and
-with the audit, and the share of them within 1.96 stated standard uncertainties. Size: RMS distance
+with the audit, the share of them within 1.96 stated standard uncertainties, and the share of the frames
+that are refused. Size: RMS distance
 in projector px that the points of the working range move. ``drawn`` is the mixture that `build`
 draws: a turn about three axes and a principal point that is off.
 """
@@ -58,16 +60,27 @@ def main() -> int:
     parser.add_argument("method", choices=("crossed", "fringe-net"))
     parser.add_argument("--draws", type=int, default=40, help="of each kind and size (default: 40)")
     parser.add_argument("--light", default="paper")
+    parser.add_argument("--sizes", type=float, nargs="+", default=SIZES_PX, metavar="PX")
     args = parser.parse_args()
     rig, random = crossed_rig(), np.random.default_rng(5)
     light = named_light(args.light).changed(calibration_px=0.0)
     objects = [name for name in OBJECTS if split_of(name) == "validation"]
-    plain, audited = load_method(args.method, rig), load_method(args.method, rig, audit=True)
+    plain, audited = (
+        load_method(args.method, rig),
+        load_method(args.method, rig, audit=True, anyway=True),
+    )
     table = Table(
         "Change",
-        numbers=("Size, px", "Without, mm", "With, mm", "Within 95%", "Within 95%, audited"),
+        numbers=(
+            "Size, px",
+            "Without, mm",
+            "With, mm",
+            "Within 95%",
+            "Within 95%, audited",
+            "Refused",
+        ),
     )
-    for kind, size_px in [("none", 0.0), *((kind, px) for kind in KINDS for px in SIZES_PX)]:
+    for kind, size_px in [("none", 0.0), *((kind, px) for kind in KINDS for px in args.sizes)]:
         rows = []
         for number in range(args.draws):
             true = rig if kind == "none" else changed(rig, kind, size_px, random)
@@ -84,9 +97,9 @@ def main() -> int:
             for answer in answers:
                 error_mm = np.abs(answer.depth - depth_mm)[known]
                 row += [error_mm.mean(), (error_mm < 1.96 * answer.sigma_mm[known]).mean()]
-            rows.append(row)
-        before, within, after, covered = np.mean(rows, axis=0)
-        shares = f"{100 * within:.0f}%", f"{100 * covered:.0f}%"
+            rows.append([*row, "does not fit" in answers[1].report["audit"]["says"]])
+        before, within, after, covered, refused = np.mean(rows, axis=0)
+        shares = [f"{100 * share:.0f}%" for share in (within, covered, refused)]
         table.add_row(kind, f"{size_px:g}", f"{before:.2f}", f"{after:.2f}", *shares)
         print(f"{kind} {size_px:g}: done", file=sys.stderr)
     print("\n".join(table.markdown()))

@@ -356,8 +356,8 @@ def png_header(content: bytes) -> PngHeader | None:
 
 class StoredImage(NamedTuple):
     """An image as a file holds it. ``levels`` are uint8 or uint16 (H, W) or (H, W, C), C as red,
-    green, blue, alpha or grey, alpha; a palette is resolved; empty where the file is compressed
-    with loss or holds several ``images``. ``form`` and ``mode`` as Pillow names them, ``bits`` of a
+    green, blue, alpha or grey, alpha; a palette is resolved; empty where the file holds several
+    ``images``. ``form`` and ``mode`` as Pillow names them, ``bits`` of a
     stored level or palette entry. ``orientation`` as EXIF numbers it, 1 where ``levels`` are
     upright; ``transparent``: whether a colour is; ``white_is_0``: of a TIFF."""
 
@@ -402,8 +402,9 @@ def _read_image(content: bytes, largest: int, unpacked: int | None) -> Answer:
             "white_is_0": image.format == "TIFF" and image.tag_v2.get(_PHOTOMETRIC) == 0,
         }
         levels: NDArray[Any] = np.zeros((0, 0), np.uint8)
-        if not lossy and facts["images"] == 1:
-            _check_complete(content, image.format, unpacked)
+        if facts["images"] == 1:
+            if not lossy:
+                _check_complete(content, image.format, unpacked)
             if image.format != "TIFF":  # which Pillow and OpenCV turn themselves
                 facts["orientation"] = image.getexif().get(_ORIENTATION, 1)
             image.load()

@@ -74,6 +74,7 @@ class GroupKey:
     edge_band_px: int
     charge_mm: float
     protocol_version: str
+    real: str
 
     @classmethod
     def of(cls, entry: Entry) -> "GroupKey":
@@ -96,6 +97,7 @@ class GroupKey:
             row.edge_band_px,
             row.charge_mm or 0.0,
             row.protocol_version,
+            info.real or "",
         )
 
     @property
@@ -146,13 +148,12 @@ class GroupKey:
     @property
     def data_title(self) -> str:
         """``fpp-bench-full version 2, 960 x 960 px``; other data by size and the first 8 digits of
-        their hash."""
+        their hash, those of real captures by the name of their set, too."""
         pixels = f"{self.size[1]} x {self.size[0]} px"
-        return (
-            f"{pixels}, data {self.data[:8]}"
-            if self.benchmark is None
-            else f"{self.data}, {pixels}"
-        )
+        if self.benchmark is not None:
+            return f"{self.data}, {pixels}"
+        real = f"Real light, {printable(self.real)}, " if self.real else ""
+        return f"{real}{pixels}, data {self.data[:8]}"
 
     @property
     def against(self) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.method import Assumption, Frames
 from fpp_ml_bench.baselines.phase.depth import Measurement
 from fpp_ml_bench.baselines.phase.method import (
+    ANYWAY,
     AUDIT,
     RANGE_AND_WALL,
     RouteMethod,
@@ -58,6 +59,7 @@ class FringeNetOptions:
         "FILE",
     )
     audit: bool = option(False, AUDIT)
+    anyway: bool = option(False, ANYWAY)
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     threads: int = 1
 
@@ -174,7 +176,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         own = Settings(min_confidence=given.min_confidence)
         other_pitch: dict[str, float] = {}
         audited: dict[str, bool] = {}
-        if given.audit and not crossed:
+        if (given.audit or given.anyway) and not crossed:
             raise PredictionError(f"{self.name} --audit needs a frame of two carriers")
         if crossed:
             self.frames_used = frames_of(rig, f"{self.name} --fringes crossed")
@@ -182,7 +184,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
             carriers = pair.carriers
             both = Fringes.of(carriers.step_rad, signs_of(carriers), networks)
             self.route = route = two_carriers(pair, PairPart(both).before, PairPart.after)
-            audited = self.use_audit(route, given.audit)
+            audited = self.use_audit(route, given.audit, given.anyway)
         else:
             other_pitch = pitch_setting(rig, way)
             model = OneCarrier(rig, Settings(way, min_confidence=given.min_confidence))
@@ -199,7 +201,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         self.title = f"Wrapped phase and mask of {frame} by {count}; order measured{more}"
         hashes = [file.sha256 for file in files]
         self.settings = {
-            **{key: value for key, value in vars(given).items() if key != "audit"},
+            **{key: value for key, value in vars(given).items() if key not in ("audit", "anyway")},
             **audited,
             "weights": config.name,
             "weights_sha256": hashes[0]

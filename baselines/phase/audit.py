@@ -31,8 +31,8 @@ from fpp_ml_bench.examination.alignment import CHANGES, Part
 GROUPS: tuple[tuple[Part, ...], ...] = (("shift", "turn"), ("roll",), ("zoom",))
 """Changes of the projector whose sizes go together."""
 CORRECTED = 4
-"""Parameters from here on are corrected: those of roll and zoom. The four before them hardly leave
-a pattern along the epipolar lines."""
+"""Parameters from here on are corrected: those of roll and zoom. What the
+four before them do along the epipolar lines leaves hardly a pattern across them."""
 SCALES_PX = np.concatenate([[1e-4], np.geomspace(0.02, 10, 11)])
 """Sizes of a change that are considered, in projector px (RMS over the points); the first is none,
 and as probable as all others together."""
@@ -46,13 +46,18 @@ FEWEST_POINTS = 300
 ALIKE = 4.0 * POINTS_PER_PERIOD**2
 """Points beside each other share their errors: those of four square periods count as one."""
 FLOOR_PX = 0.05
-"""Error of the phases that looks like a change, in projector px: the largest pattern that a right
-calibration left on validation views."""
+"""Error of the phases that looks like a change, in projector px: a right calibration leaves 0.04 to
+0.09 px (RMS) across the lines on validation views."""
 CERTAIN = 2.0
 """A change is corrected from so many standard uncertainties, so that a right calibration stays as it
 is."""
 ROUNDS = 6
 """Fits in a row, each without the points that the one before does not explain."""
+UNEXPLAINED = 0.7
+"""Of the distance from the epipolar lines that phases without any order would have: a frame that
+stays above it after the changes does not fit the calibration. On validation views a right
+calibration leaves at most 0.06 of it in `paper`, 0.48 in `workshop`, 0.64 in `hard`; a roll or zoom
+of 4 px and more 0.9 to 1.0, 0.2 (where it is corrected) to 1.2, and 0.6 to 1.1."""
 FURTHEST = 4.0
 """Residual, in robust standard deviations, beyond which a point is left out."""
 
@@ -60,17 +65,34 @@ FURTHEST = 4.0
 @dataclass(frozen=True)
 class Audit:
     """Of one frame: ``points`` that were used; ``across_px``: RMS distance from the epipolar lines
-    in projector px, before and after the correction, and ``noise_px`` of one point; ``roll_deg``
-    and ``zoom_percent``, of the projector against the calibration, each with its standard
-    uncertainty; ``along_px``: standard uncertainty along the lines that is left, from what can't be
-    seen."""
+    in projector px, before and after the correction, ``chance_px`` that of phases without any
+    order, and ``noise_px`` of one point; ``roll_deg`` and ``zoom_percent``, of the projector against
+    the calibration, each with its standard uncertainty; ``along_px``: standard uncertainty along
+    the lines that is left, from what can't be seen."""
 
     points: int
     across_px: tuple[float, float]
+    chance_px: float
     noise_px: float
     roll_deg: tuple[float, float]
     zoom_percent: tuple[float, float]
     along_px: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether a small motion of the projector explains the frame, as far as it tells."""
+        return self.across_px[1] <= UNEXPLAINED * self.chance_px
+
+    @property
+    def finding(self) -> str:
+        """What is wrong where it does not fit, and what to do."""
+        return (
+            f"the calibration does not fit: across the epipolar lines the phases are "
+            f"{self.across_px[0]:.2f} px (RMS) off, {self.across_px[1]:.2f} px after the best roll, "
+            f"zoom and shift of the projector, and phases without any order would be "
+            f"{self.chance_px:.2f} px off; calibrate again, or give --anyway, whose depth is not to "
+            f"be trusted"
+        )
 
     def report(self) -> Mapping[str, Any]:
         """Plain data, and a sentence."""
@@ -83,10 +105,13 @@ class Audit:
             f"degrees and a zoom by {self.zoom_percent[0]:+.2f} +- {self.zoom_percent[1]:.2f}%; "
             f"along them {self.along_px:.2f} px stay uncertain"
         )
+        if not self.fits:
+            says = self.finding
         return {
             "audit": {
                 "points": self.points,
                 "across_px": list(self.across_px),
+                "chance_px": self.chance_px,
                 "noise_px": self.noise_px,
                 "roll_deg": list(self.roll_deg),
                 "zoom_percent": list(self.zoom_percent),
@@ -96,7 +121,7 @@ class Audit:
         }
 
 
-NOTHING = Audit(0, (0.0, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), 0.0)
+NOTHING = Audit(0, (0.0, 0.0), 0.0, 0.0, (0.0, 0.0), (0.0, 0.0), 0.0)
 
 
 def measure_audited(
@@ -155,6 +180,7 @@ def _audited(fitted: Fitted) -> tuple[Audit, _Changes | None]:
     changes = _changes_px(fitted)
     unit = 1 / np.sqrt(2 * np.mean(changes[..., used] ** 2, axis=(1, 2)))
     changes = changes * unit[:, None, None, None]
+    chance_px = _chance_px(seen, used, ahead[:, used])
     across = (ahead[0] * changes[:, 1] - ahead[1] * changes[:, 0])[:, used].T
     off = (ahead[0] * off_px[1] - ahead[1] * off_px[0])[used]
     across, off, noise_px = _without_outliers(across, off)
@@ -171,6 +197,7 @@ def _audited(fitted: Fitted) -> tuple[Audit, _Changes | None]:
     audit = Audit(
         len(off),
         (_rms(off), _rms(off - across @ mean)),
+        chance_px,
         noise_px,
         (float(np.rad2deg(size[4])), float(np.rad2deg(sigma[4]))),
         (100 * float(size[5]), 100 * float(sigma[5])),
@@ -191,6 +218,24 @@ def _changes_px(fitted: Fitted) -> NDArray[np.float64]:
     terms = [term for group in GROUPS for part in group for term in CHANGES[part].terms(x, y)]
     focal = np.array([rig.projector.fx, rig.projector.fy])
     return np.array(terms) * focal[:, None, None]
+
+
+def _chance_px(seen: CrossedObservation, used: Mask, ahead: NDArray[np.float64]) -> float:
+    """RMS distance in px from the epipolar lines of pixels ``used``, which run along ``ahead`` (2,
+    P), in the best order of phases that are drawn at random."""
+    carriers = seen.carriers
+    gain, ends = carriers.gain[:, used], [carriers.nearness(end)[used] for end in seen.range_mm]
+    main = int(np.median(np.abs(gain[1])) > np.median(np.abs(gain[0])))
+    span = np.median(np.abs(gain[main] * (ends[0] - ends[1]))) / TAU
+    turns = np.arange(max(1, round(float(span))))[:, None]
+    drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, gain.shape[1])
+    beside = wrapped(drawn - TAU * turns * gain[1 - main] / gain[main])
+    along_u, along_v = np.linalg.inv(carriers.family.cycles_per_px)[:, 1 - main]
+    return _rms(
+        ((ahead[0] * along_v - ahead[1] * along_u) * beside / TAU)[
+            np.abs(beside).argmin(axis=0), np.arange(beside.shape[1])
+        ]
+    )
 
 
 def _without_outliers(

@@ -96,6 +96,7 @@ AUDIT = (
     "and report it"
 )
 """Help of ``--audit``."""
+ANYWAY = "with --audit: take frames that the calibration does not fit, too"
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class CrossedOptions:
 
     frames: int = option(1, "crossed frames, 1 or 3 (default: 1)", "N")
     audit: bool = option(False, AUDIT)
+    anyway: bool = option(False, ANYWAY)
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     mask: str | Path | None = option(None, MASK, "FILE")
 
@@ -116,6 +118,8 @@ class RouteMethod(Method, Generic[Measured]):
     mask: NDArray[np.bool_] | None = None
     audited: CrossedRoute | None = None
     """The route, where the calibration is to be audited."""
+    anyway: bool = False
+    """Whether a frame that the calibration does not fit is taken."""
 
     def use_mask(self, mask: str | Path | None) -> dict[str, str]:
         """Take the object mask of every sample from a file (`captures.read_mask`), if there is one;
@@ -143,19 +147,24 @@ class RouteMethod(Method, Generic[Measured]):
 
     def answer(self, frames: Frames) -> Answer:
         """Depth, 0 = background, or masked where ``min_confidence`` is above 0, and its standard
-        uncertainty."""
+        uncertainty. Raises `DecodeError` for a frame that an audited calibration does not fit."""
         if self.audited is None:
             measurement: Measurement = self.measure(frames)
             return Answer(measurement.depth_mm, measurement.sigma_mm)
         measurement, audit = measure_audited(self.audited, self.images(frames), self.mask)
+        if not (audit.fits or self.anyway):
+            raise DecodeError(audit.finding)
         return Answer(measurement.depth_mm, measurement.sigma_mm, audit.report())
 
-    def use_audit(self, route: CrossedRoute, wanted: bool) -> dict[str, bool]:
-        """Audit the calibration with every sample, if ``wanted``; what it adds to the settings."""
+    def use_audit(self, route: CrossedRoute, wanted: bool, anyway: bool) -> dict[str, bool]:
+        """Audit the calibration with every sample, if ``wanted``, and take what it does not fit
+        ``anyway``; what that adds to the settings. Raises `PredictionError` for ``anyway`` alone."""
         if not wanted:
+            if anyway:
+                raise PredictionError(f"{self.name} --anyway: expected --audit, which it overrules")
             return {}
-        self.audited, self.reports = route, True
-        return {"audit": True}
+        self.audited, self.reports, self.anyway = route, True, anyway
+        return {"audit": True} | ({"anyway": True} if anyway else {})
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
         seen = self.route.observe(self.images(frames), self.mask)
@@ -347,7 +356,7 @@ class CrossedMethod(RouteMethod[Measurement]):
         self.title = f"Crossed fringes of {pitches} px, {count}, nothing learned"
         self.settings = {"min_confidence": given.min_confidence} | self.use_mask(given.mask)
         self.settings |= {} if frames == 1 else {"frames": frames}
-        self.settings |= self.use_audit(route, given.audit)
+        self.settings |= self.use_audit(route, given.audit, given.anyway)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:

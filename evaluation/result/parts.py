@@ -271,14 +271,16 @@ class DatasetInfo(SparseModel):
     shift``, ``crossed`` or ``Gray code``.
 
     ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version
-    whose content is another one is refused."""
+    whose content is another one is refused. ``real``: name of the set of public captures that it
+    says it is (`fpp-bench import --real`)."""
 
-    SPARSE = ("benchmark",)
+    SPARSE = ("benchmark", "real")
 
     name: Text
     content: Annotated[Content, Field(min_length=1, max_length=9)]
     code: Text
     benchmark: BenchmarkInfo | None = None
+    real: Text | None = None
     split: Literal["train", "validation", "test", "all"]
     size: Annotated[list[Whole], Field(min_length=2, max_length=2)]
     samples: Whole

@@ -152,6 +152,7 @@ def evaluate(
             "benchmark": {"name": benchmark.name, "version": benchmark.version}
             if benchmark
             else None,
+            "real": dataset.real_set,
             "split": split,
             "size": list(dataset.size),
             "samples": len(scored),

@@ -121,6 +121,10 @@ BENCH = Program(
                 "tradeoff:measure",
                 "error against run time, frames and memory, and how the time grows",
             ),
+            "certify": (
+                "certify:certify_method",
+                "a simulated type test on gauges: probing error, sphere spacing, flatness",
+            ),
             "stability": (
                 "tradeoff:check",
                 "check extreme cases against higher precision and theory",

@@ -92,7 +92,7 @@ def decode(
     started = perf_counter()
     lock = exclusive(out / LOCK_FILE, out, "decoding into this folder", CaptureError)
     with lock, progress_bar("decoding", 4, "steps") as advance:
-        capture = read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
+        capture = read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour, lossy=True)
         advance(1)
         object_mask = None if mask is None else read_mask(mask, capture.frames.shape[1:])
         try:

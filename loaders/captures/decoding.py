@@ -32,9 +32,11 @@ from fpp_ml_bench.decoding.decode import Decoded, Directions, check_limits, deco
 from fpp_ml_bench.decoding.triangulation import ASSUMED_NOISE_GREY, depth_sigma_mm, noise_of_frames
 from fpp_ml_bench.errors import CalibrationError, CaptureError, DecodeError
 from fpp_ml_bench.examination.examine import examine
-from fpp_ml_bench.examination.findings import Examination, RefusedCapture
+from fpp_ml_bench.examination.findings import Examination, Finding, RefusedCapture
 from fpp_ml_bench.files import file_content, visible
 from fpp_ml_bench.loaders.captures.images import (
+    LOSSLESS,
+    LOSSY,
     Capture,
     CapturedFrames,
     Splits,
@@ -68,6 +70,7 @@ CAUSES = {
     "not this scanner's",
 }
 """Why nothing is decoded, by the reason of most pixels."""
+JPEG_BLOCK_PX = 8
 FEWEST_POSES = 3
 RANGE_MARGIN = 0.1
 """A calibrated rig's working range is that of the boards' points, widened by this share of their
@@ -171,6 +174,9 @@ def _examined_and_decoded(
         limits=limits,
         calibrated=calibrated,
     )
+    if capture.lossy:
+        found = _compressed(capture), *examination.findings
+        examination = replace(examination, findings=found)
     if examination.refused and not anyway:
         raise RefusedCapture(str(folder), examination)
     frames = capture.frames
@@ -180,6 +186,25 @@ def _examined_and_decoded(
         frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads
     )
     return decoded, examination
+
+
+def _compressed(capture: CapturedFrames) -> Finding:
+    """What compression did to frames of which some are JPEG."""
+    steps = np.abs(np.diff(capture.frames.astype(np.float64), axis=-1)).mean(axis=(0, 1))
+    borders = np.arange(len(steps)) % JPEG_BLOCK_PX == JPEG_BLOCK_PX - 1
+    across, between = (
+        float(steps[where].sum() / max(where.sum(), 1)) for where in (borders, ~borders)
+    )
+    first, *others = capture.lossy
+    named = f"{first.name} and {len(others)} more are" if others else f"{first.name} is"
+    return Finding(
+        "compressed with loss",
+        "refuse",
+        f"{named} {LOSSY}: grey levels change by {across:.2f} across a border of blocks and by "
+        f"{between:.2f} elsewhere",
+        "JPEG",
+        LOSSLESS,
+    )
 
 
 def _main_reason(decoded: Decoded) -> Reason:
@@ -252,7 +277,7 @@ class CaptureReader(RowReader):
         """The capture's row: frames of 8 bits, and depth from the frames as they were captured.
         Raises `CaptureError` for frames that can't be read, that are of another size than the rig's
         camera, that the examination refuses (unless ``anyway``), and that give almost no depth."""
-        captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
+        captured = read_frames(capture.files, bits=self.bits, colour=self.colour, lossy=True)
         try:
             decoded, examination = _examined_and_decoded(
                 captured, self.rig, self.limits, capture.sample in self.anyway
@@ -421,7 +446,7 @@ def board_poses(
     unfit: list[CaptureError | CalibrationError] = []
     seen: dict[int, tuple[Path, int]] = {}
     for folder in pose_folders(captures):
-        capture = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour)
+        capture = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour, lossy=True)
         frames = capture.frames
         height, width = frames.shape[1:]
         if not poses:

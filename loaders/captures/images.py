@@ -43,6 +43,8 @@ _OTHER_IMAGES = (
 _MODES = ("L", "LA", "I", "I;16", "I;16L", "I;16B", "RGB", "RGBA", "P", "PA")
 _WHOLE_BITS = (8, 10, 12, 14, 16)
 CAPTURE_AGAIN = "capture or copy it again"
+LOSSY = "compressed with loss (JPEG), and its blocks distort the phase"
+LOSSLESS = "capture the frames as PNG, BMP or TIFF"
 _THREADS = 2
 """Each has a process that reads (`fpp_ml_bench.containers`)."""
 _QUARTER_TURNS, _MIRRORED = {3: 2, 4: 2, 5: -1, 6: -1, 7: 1, 8: 1}, (2, 4, 5, 7)
@@ -55,12 +57,13 @@ class CapturedFrames:
     """``frames`` (N, H, W): uint8 grey levels, or float32 grey levels of 0 to 255 where the files
     have more than 8 bits or channels were weighted; ``files`` in the same order. ``full_scale``:
     the stored level that became 255. ``note`` says what was assumed about it, "" where nothing
-    was."""
+    was. ``lossy``: files that are compressed with loss."""
 
     frames: NDArray[Any]
     files: tuple[Path, ...]
     full_scale: int = GREY_LEVELS
     note: str = ""
+    lossy: tuple[Path, ...] = ()
 
     @property
     def names(self) -> list[str]:
@@ -74,6 +77,7 @@ class _Image(NamedTuple):
     """Of a stored level, as the file says."""
     used: int
     """Bitwise or of all stored levels."""
+    lossy: bool
 
 
 def read_frames(
@@ -82,14 +86,16 @@ def read_frames(
     count: int | None = None,
     bits: int | None = None,
     colour: str | None = None,
+    lossy: bool = False,
 ) -> CapturedFrames:
     """The frames in ``source``, which is as in `frame_files`.
 
     ``count``: how many there must be. ``bits``: 8 to 16, of the camera, where the files have 16;
     they may be the low or the high bits. By default: where all levels are multiples of 4 or more,
     high bits; else the fewest of 8, 10, 12, 14, 16 bits that hold all levels; the result's ``note``
-    says which. ``colour``: which of `COLOURS` to take where channels differ. Raises `CaptureError`
-    naming the file for anything but complete, lossless images of one size and bit depth, for levels
+    says which. ``colour``: which of `COLOURS` to take where channels differ. ``lossy``: read JPEG,
+    too, and name it in the result. Raises `CaptureError` naming the file for anything but complete,
+    lossless images of one size and bit depth, for levels
     that need more than ``bits``, and for colour without ``colour``."""
     check_options(bits, colour)
     files = frame_files(source)
@@ -100,7 +106,7 @@ def read_frames(
             "capture what is missing, or give a pattern that matches the frames only"
         )
     with ThreadPoolExecutor(_THREADS) as pool:
-        images = list(pool.map(lambda file: _read(file, colour), files))
+        images = list(pool.map(lambda file: _read(file, colour, lossy), files))
     first_image = images[0]
     for file, image in zip(files, images, strict=True):
         if (image.levels.shape, image.bits) != (first_image.levels.shape, first_image.bits):
@@ -111,12 +117,14 @@ def read_frames(
             )
     used = int(np.bitwise_or.reduce([image.used for image in images]))
     full_scale, note = _full_scale(used, first_image.bits, bits, files[0].parent)
+    compressed = tuple(file for file, image in zip(files, images, strict=True) if image.lossy)
     if all(image.levels.dtype == np.uint8 for image in images):
-        return CapturedFrames(np.stack([image.levels for image in images]), tuple(files))
+        frames = np.stack([image.levels for image in images])
+        return CapturedFrames(frames, tuple(files), lossy=compressed)
     frames = np.empty((len(images), *first_image.levels.shape), np.float32)
     for index, image in enumerate(images):
         frames[index] = image.levels * (np.float64(GREY_LEVELS) / full_scale)
-    return CapturedFrames(frames, tuple(files), full_scale, note)
+    return CapturedFrames(frames, tuple(files), full_scale, note, compressed)
 
 
 def check_options(bits: int | None, colour: str | None) -> None:
@@ -219,8 +227,8 @@ def _full_scale(used: int, stored_bits: int, bits: int | None, where: Path) -> t
     return (1 << assumed) - 1, f"no level is above {(1 << assumed) - 1}: taken as {assumed} bits"
 
 
-def _read(file: Path, colour: str | None) -> _Image:
-    """An image as grey levels, checked."""
+def _read(file: Path, colour: str | None, lossy: bool) -> _Image:
+    """An image as grey levels, checked; ``lossy``: compressed with loss, too."""
     forms, suffix = "expected a PNG, BMP or TIFF image", file.suffix.lower()
     if suffix in _OTHER_IMAGES and suffix not in (".jpg", ".jpeg", ".jpe"):
         raise CaptureError(
@@ -239,6 +247,8 @@ def _read(file: Path, colour: str | None) -> _Image:
         raise CaptureError(f"{file}: {error}; {CAPTURE_AGAIN}") from None
     levels = np.atleast_3d(image.levels)
     alpha = levels.shape[2] in (2, 4)
+    if image.lossy and not lossy:
+        raise CaptureError(f"{file}: is {LOSSY}; {LOSSLESS}")
     if problem := _problem(image, levels[..., -1] if alpha else None):
         raise CaptureError(f"{file}: {problem}")
     levels = np.rot90(
@@ -247,15 +257,15 @@ def _read(file: Path, colour: str | None) -> _Image:
     if image.orientation in _MIRRORED:
         levels = np.fliplr(levels)
     return _Image(
-        _grey(levels, colour, file), image.bits, int(np.bitwise_or.reduce(levels, axis=None))
+        _grey(levels, colour, file),
+        image.bits,
+        int(np.bitwise_or.reduce(levels, axis=None)),
+        image.lossy,
     )
 
 
 def _problem(image: StoredImage, alpha: NDArray[Any] | None) -> str | None:
     """Why an image is no frame, and what to do."""
-    if image.lossy:
-        lossy = "is compressed with loss (JPEG), and its blocks distort the phase"
-        return f"{lossy}; capture the frames as PNG, BMP or TIFF"
     if image.images != 1:
         return f"expected one image, found {image.images}; write each frame to its own file"
     if image.mode not in _MODES or not 8 <= image.bits <= 16:

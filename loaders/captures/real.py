@@ -1,5 +1,5 @@
 """Real captures that others published, as datasets: each set is described by a YAML file in ``sets/``
-or of the user's own, and read from the user's copy of the repository that holds it.
+or of the user's own, and read from the user's copy of the repository that holds it::
 
     title: Plaster relief of an eye, one camera
     source: https://github.com/Practice3DVision/SLMaster
@@ -20,15 +20,16 @@ depth, as those of any capture; a pixel that they don't decode has no truth and 
 
 from dataclasses import dataclass
 from hashlib import sha256
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import Field
 
 from fpp_ml_bench.coding.code import Limits
+from fpp_ml_bench.constants import OBJECT_NAME, VIEW_NAME
 from fpp_ml_bench.containers import LARGEST_BYTES
 from fpp_ml_bench.errors import CaptureError, RigError
-from fpp_ml_bench.files import file_content, read_yaml
+from fpp_ml_bench.files import file_content, printable, read_yaml
 from fpp_ml_bench.loaders.captures.decoding import CaptureReader, captures_plan
 from fpp_ml_bench.loaders.captures.images import Capture, check_options
 from fpp_ml_bench.loaders.storage.assembly import Assembly
@@ -82,13 +83,26 @@ def read_set(name: str) -> ReadSet:
         rig = rig_from_dict(content.rig)
     except RigError as error:
         raise CaptureError(f"{file}: rig: {error}") from None
+    if not content.captures:
+        raise CaptureError(f"{file}: captures: expected an object and more, got none")
     for object_name, views in content.captures.items():
         for view, files in views.items():
+            where = f"{file}: captures.{printable(object_name)}.{printable(view)}"
+            if not (OBJECT_NAME.fullmatch(object_name) and VIEW_NAME.fullmatch(view)):
+                raise CaptureError(
+                    f"{where}: expected an object of letters, digits, - and _, and a view of "
+                    f"letters, digits and -"
+                )
             if len(files) != len(rig.sequence):
                 raise CaptureError(
-                    f"{file}: captures.{object_name}.{view}: expected the {len(rig.sequence)} files "
-                    f"of the rig's sequence, got {len(files)}"
+                    f"{where}: expected the {len(rig.sequence)} files of the rig's sequence, got "
+                    f"{len(files)}"
                 )
+            for name in files:
+                if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+                    raise CaptureError(
+                        f"{where}: {printable(name)}: expected a path inside the repository"
+                    )
     return ReadSet(file.stem, content, rig)
 
 

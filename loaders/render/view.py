@@ -129,7 +129,7 @@ class Studio:
         self, mesh: SolidMesh, view: str, moved_m: NDArray[np.float64] | None = None
     ) -> TracedView:
         """The object in its place, or ``moved_m`` (3,) from there, seen and lit."""
-        settings, rig, light = self.settings, self.rig, self.light
+        settings, rig = self.settings, self.rig
         vertices_m, distance_m = place(mesh, view, settings.rig, settings.placement, settings.seed)
         if settings.object_scale != 1:
             vertices_m = vertices_m / settings.object_scale
@@ -149,8 +149,24 @@ class Studio:
                 f"{distance_m * settings.object_scale:g} m from the camera is {pixel_mm:.3g} mm; scale it up, or build "
                 f"with more px (--size)"
             )
+        turned_degrees = VIEW_DEGREES[VIEWS.index(view)]
         stream = (settings.seed, mesh.name, view)
-        object_light = self.lighting.upon(mesh, traced, VIEW_DEGREES[VIEWS.index(view)], offset_m)
+        return self.lit(mesh, traced, hits, distance_m, turned_degrees, offset_m, stream)
+
+    def lit(
+        self,
+        mesh: SolidMesh,
+        traced: TracedObject,
+        hits: Hits,
+        distance_m: float,
+        degrees: float,
+        offset_m: NDArray[np.float64],
+        stream: tuple[object, ...],
+    ) -> TracedView:
+        """What is seen of ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be
+        ``traced``, with its light."""
+        rig, light = self.rig, self.light
+        object_light = self.lighting.upon(mesh, traced, degrees, offset_m)
         x, y = (axis.ravel()[hits.pixels] for axis in rig.camera.rays())
         points_m = along_rays(x, y, hits.depth_m)
         lit = object_light.at(points_m, hits.normals, hits.triangle)

@@ -165,7 +165,7 @@ def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> 
         source = f", from {url} at commit `{settings['commit']}`"
     text = _LIMITS.get(manifest.origin, _IMPORTED_LIMITS)
     if real := settings.get("set"):
-        text = _REAL_LIMITS + "".join(f"- {line}.\n" for line in real["known"])
+        text = _REAL_LIMITS
         source = f"{real['source']} at commit `{real['commit']}` (licence: {real['licence']})"
     limits = text.format(
         light=settings.get("light", {}).get("name", "paper"),
@@ -176,6 +176,8 @@ def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> 
         if settings.get("rig_assumed")
         else "the one given at the import",
     )
+    if real:
+        limits += "".join(f"- {line}.\n" for line in real["known"])
     return _END.format(columns="\n".join(rows), limits=limits)
 
 

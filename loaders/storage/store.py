@@ -227,6 +227,12 @@ class DatasetFolder:
             raise DatasetError(f"{self.path}: has no {FLAGS} ({self.manifest.origin} data)")
         return self._image(sample, DATA_GROUP, FLAGS)
 
+    @property
+    def real_set(self) -> str | None:
+        """Name of the set of public captures that it was imported as (`captures.real`)."""
+        described = self.manifest.settings.get("set")
+        return printable(str(described["name"]), 100) if isinstance(described, dict) else None
+
     def void(self, sample: str, column: str = DEPTH) -> NDArray[np.bool_]:
         """Pixels that count in no score against ``column``, bool (H, W): of ``depth_exact``
         `exact_void`, of ``depth`` `void_pixels`, with surface that has no decoded depth. In data

@@ -112,6 +112,8 @@ def test_short_names_of_shipped_rows(shipped):
         "classical-03-both-fewest": "Classical 3, both, no Gray",
         "small-unet-individual-rmse-seed_1": "UNet RMSE s1",
         "small-unet-individual-rmse-horizontal": "UNet RMSE horizontal",
+        "small-unet-global-rmse-guided": "UNet global RMSE, guided",
+        "small-unet-global-rmse_physics_0.05": "UNet global RMSE + physics 0.05",
         "small-transunet-individual-hybrid_l1_0.7": "TransUNet hybrid L1 0.7",
         "small-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
     }

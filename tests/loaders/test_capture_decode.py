@@ -2,6 +2,7 @@
 codes alone."""
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -154,6 +155,24 @@ def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
     report = json.loads((tmp_path / "out" / "decode.json").read_text())
     assert report["examination"]["findings"][0]["name"] == "equal frames"
     assert report["pixels"] and not (tmp_path / "out" / "depth.mat").exists()
+
+
+def test_jpeg_is_a_finding(capture, tmp_path, capsys):
+    folder, row = capture
+    (tmp_path / "scan").mkdir()
+    for index, frame in row.frames.items():
+        cv2.imwrite(
+            str(tmp_path / "scan" / f"frame_{index}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 80]
+        )
+    assert decode(folder, tmp_path / "scan", tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert "compressed with loss: frame_0.jpg and 13 more are" in said and "--anyway" in said
+    across, between = map(float, re.findall(r"change by ([\d.]+) across.* by ([\d.]+)", said)[0])
+    assert across > 1.05 * between
+    assert decode(folder, tmp_path / "scan", tmp_path / "out", "--anyway", "--forms", "npy") == 0
+    depth_mm = np.load(tmp_path / "out" / "depth.npy")
+    both = (depth_mm > 0) & (row.depth_exact_mm > 0)
+    assert np.median(np.abs(depth_mm - row.depth_exact_mm)[both]) < 4
 
 
 def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(

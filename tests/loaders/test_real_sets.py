@@ -39,7 +39,7 @@ def copied(tmp_path):
         "source": "https://example.com/plane",
         "commit": "0123456",
         "licence": "CC0",
-        "known": ["a third of it is dark"],
+        "known": ["a third of it is dark {so}"],
         "rig": RIG.to_dict(),
         "captures": {"plane": {"front": hashes}},
     }
@@ -56,7 +56,7 @@ def test_a_real_set_is_a_dataset_whose_undecoded_pixels_count_nowhere(copied, ca
     assert importing(copied) == 0
     said = capsys.readouterr().out
     assert "A plane, from https://example.com/plane at commit 0123456; licence: CC0" in said
-    assert "known: a third of it is dark" in said and "differ" not in said
+    assert "known: a third of it is dark {so}" in said and "differ" not in said
     opened = DatasetFolder(copied / "set")
     (sample,) = opened.splits["test"]
     void, depth_mm = opened.void(sample), opened.depth_mm(sample)
@@ -70,6 +70,8 @@ def test_a_real_set_is_a_dataset_whose_undecoded_pixels_count_nowhere(copied, ca
     assert metrics["two_sided_mae_mm"] == pytest.approx(error_mm, rel=1e-4)
     assert metrics["background_mae_mm"] is None and metrics["invented_share"] == 0
     assert "without background" in capsys.readouterr().out
+    assert run("leaderboard", result) == 0
+    assert "Real light, plane, " in capsys.readouterr().out
 
 
 def test_files_of_another_commit_are_named(copied, capsys):
@@ -105,7 +107,12 @@ def test_options_that_a_set_does_not_take(copied, words, said, capsys):
 
 def test_a_file_that_describes_no_set(copied, capsys):
     described = yaml.safe_load((copied / "plane.yaml").read_text())
+    files = described["captures"]["plane"]["front"]
+    outside = {f"../{name}": digest for name, digest in files.items()}
     wrong = [
+        ({"captures": {}}, "captures: expected an object"),
+        ({"captures": {"a/b": {"front": files}}}, "expected an object of letters"),
+        ({"captures": {"plane": {"front": outside}}}, "expected a path inside the repository"),
         ({"licence": None}, "licence"),
         ({"rig": {**described["rig"], "camera": {}}}, "rig: camera"),
         (

@@ -8,7 +8,7 @@ from crossed_scenes import RIG, frame, route, slab
 
 from fpp_ml_bench.baselines.phase.audit import CERTAIN, measure_audited
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 
 ROLL_DEG, ZOOM_PERCENT = 0.2, -0.3
@@ -72,6 +72,20 @@ def test_roll_and_zoom_are_found_and_corrected(
         assert size == pytest.approx(true, abs=3 * sigma)
     assert audit.across_px[1] < 0.5 * audit.across_px[0]
     assert "across the epipolar lines" in audit.report()["audit"]["says"]
+
+
+def test_a_frame_that_no_small_motion_explains_is_refused() -> None:
+    image = frame(surface(), rolled(4.0))
+    _, audit = measure_audited(route(), image)
+    assert not audit.fits and audit.report()["audit"]["says"] == audit.finding
+    frames = [None] * len(RIG.sequence)
+    frames[RIG.sequence.crossed_frames[0]] = image
+    with pytest.raises(DecodeError, match=r"calibration does not fit.*calibrate again"):
+        load_method("crossed", RIG, audit=True).answer(frames)
+    answer = load_method("crossed", RIG, audit=True, anyway=True).answer(frames)
+    assert answer.depth.any() and "does not fit" in answer.report["audit"]["says"]
+    with pytest.raises(PredictionError, match="--anyway: expected --audit"):
+        load_method("crossed", RIG, anyway=True)
 
 
 def test_what_lies_along_the_lines_is_not_seen_and_stated() -> None:

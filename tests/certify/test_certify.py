@@ -1,0 +1,190 @@
+"""A simulated type test: gauges against closed forms, fits against trimesh, errors put in on purpose,
+and the certificate."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from fpp_ml_bench.baselines.certify import gauges as module
+from fpp_ml_bench.baselines.certify.certificate import certify, scenes_of, write_certificate
+from fpp_ml_bench.baselines.certify.gauges import Gauge, TracedGauge, Volume, gauges
+from fpp_ml_bench.baselines.certify.quantities import QUANTITIES, fit_plane, fit_sphere, measure
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import BuildError, PredictionError
+from fpp_ml_bench.loaders.render.raycast import PixelRays
+from fpp_ml_bench.optics.named_rigs import paper_rig
+
+RIG = paper_rig(480)
+RAYS = RIG.camera.rays()
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """One gauge of each kind."""
+    for name in ("SPHERES", "BARS", "PLANES", "OTHERS"):
+        monkeypatch.setattr(module, name, 1)
+
+
+def seen(gauge: Gauge) -> tuple[np.ndarray, np.ndarray]:
+    """Which surface each pixel sees, and its depth in mm."""
+    hits = TracedGauge(gauge).primary(PixelRays.of(RIG.camera))
+    part, depth_mm = np.full(RAYS[0].shape, -1, np.int8), np.zeros(RAYS[0].shape)
+    part.ravel()[hits.pixels] = gauge.part[hits.triangle]
+    depth_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
+    return part, depth_mm
+
+
+def values_of(gauge: Gauge, depth_mm: np.ndarray | None = None) -> dict[str, float | None]:
+    part, exact_mm = seen(gauge)
+    depth_mm = exact_mm if depth_mm is None else depth_mm
+    return dict(measure(gauge, part, exact_mm, depth_mm, RAYS).values)
+
+
+def of_kind(kind: str) -> Gauge:
+    return next(gauge for gauge in gauges(RIG) if gauge.kind == kind)
+
+
+def test_all_gauges_are_in_the_volume_and_exact():
+    volume = Volume.of(RIG)
+    kinds: dict[str, int] = {}
+    for gauge in gauges(RIG):
+        assert volume.holds(gauge.mesh.vertices_m), gauge.name
+        for symbol, value in values_of(gauge).items():
+            limit = 1.5 if symbol == "E" else 1e-8
+            assert value is not None and abs(value) < limit, (gauge.name, symbol)
+        kinds[gauge.kind] = kinds.get(gauge.kind, 0) + 1
+    assert kinds == {"sphere": 10, "ball bar": 7, "plane": 6, "step": 3, "wedge": 3}
+
+
+def test_the_depth_of_a_sphere_is_that_of_the_closed_form():
+    gauge = of_kind("sphere")
+    part, depth_mm = seen(gauge)
+    points = np.stack([RAYS[0] * depth_mm, RAYS[1] * depth_mm, depth_mm], axis=-1)[part == 0]
+    (surface,) = gauge.surfaces
+    away = np.linalg.norm(points - MM_PER_M * surface.point_m, axis=1)
+    np.testing.assert_allclose(away, MM_PER_M * surface.radius_m, rtol=1e-12)
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.05])
+def test_fits_are_those_of_trimesh(noise_mm):
+    random = np.random.default_rng(3)
+    away = random.normal(size=(400, 3))
+    away = away / np.linalg.norm(away, axis=1, keepdims=True) * [1, 1, 0.6]
+    away = away / np.linalg.norm(away, axis=1, keepdims=True)
+    centre, radius = np.array([12.0, -7.0, 1800.0]), 60.0
+    points = centre + radius * away + noise_mm * random.normal(size=(400, 3))
+    # Rejecting nothing, so that both have the same points.
+    fit = fit_sphere(points[:300])
+    if noise_mm == 0:
+        theirs, their_radius, _ = trimesh.nsphere.fit_nsphere(points[:300])
+        np.testing.assert_allclose(fit.values, [*theirs, their_radius], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(fit.values, [*centre, radius], rtol=0, atol=1e-9)
+    else:
+        np.testing.assert_allclose(fit.values, [*centre, radius], rtol=0, atol=0.05)
+    plane = np.column_stack([random.uniform(-90, 90, (300, 2)), np.zeros(300)])
+    plane = plane @ trimesh.transformations.rotation_matrix(0.3, [1, 2, 0])[:3, :3].T + centre
+    _, normal = trimesh.points.plane_fit(plane)
+    ours = fit_plane(plane)
+    assert abs(abs(ours.values[3:] @ normal) - 1) < 1e-12 and ours.range_mm < 1e-9
+
+
+def test_three_in_a_thousand_points_are_rejected_and_no_more():
+    points = np.column_stack([np.random.default_rng(0).uniform(-9, 9, (1000, 2)), np.zeros(1000)])
+    points[:3, 2] = 40.0
+    assert fit_plane(points).range_mm < 1e-9
+    points[3, 2] = 40.0
+    assert fit_plane(points).range_mm > 30
+
+
+def test_errors_put_in_on_purpose_are_recovered():
+    scale = 1.001
+    bar, sphere, plane, step, wedge = map(of_kind, ("ball bar", "sphere", "plane", "step", "wedge"))
+    spacing = MM_PER_M * np.linalg.norm(bar.surfaces[1].point_m - bar.surfaces[0].point_m)
+    diameter = 2 * MM_PER_M * sphere.surfaces[0].radius_m
+    assert values_of(bar, seen(bar)[1] * scale)["SD"] == pytest.approx(0.001 * spacing, abs=1e-6)
+    assert values_of(sphere, seen(sphere)[1] * scale)["PS"] == pytest.approx(
+        0.001 * diameter, abs=1e-6
+    )
+    # A sphere that is 50 um larger than its gauge says.
+    (surface,) = sphere.surfaces
+    larger = replace(surface, radius_m=surface.radius_m + 5e-5)
+    part, depth_mm = seen(replace(sphere, surfaces=(larger,)))
+    found = measure(sphere, part, depth_mm, depth_mm, RAYS).values
+    assert found["PS"] == pytest.approx(0.1, abs=1e-6) and found["PF"] < 1e-6
+    # A plane with a wave, a step that one order of the fringes lifts, a wedge that is stretched.
+    exact_mm = seen(plane)[1]
+    wave = np.where(exact_mm > 0, exact_mm + 0.2 * np.sin(RAYS[0] * 400), 0)
+    assert values_of(plane, wave)["F"] == pytest.approx(0.4, rel=0.03)
+    part, exact_mm = seen(step)
+    assert values_of(step, np.where(part == 1, exact_mm - 90, exact_mm))["H"] > 80
+    part, exact_mm = seen(wedge)
+    flatter = np.where(exact_mm > 0, exact_mm.min(where=exact_mm > 0, initial=9e9), 0)
+    assert values_of(wedge, np.where(part >= 0, (exact_mm + flatter) / 2, 0))["W"] > 10
+
+
+def test_a_point_without_an_answer_is_refused_and_nothing_is_fitted_to_too_few():
+    sphere = of_kind("sphere")
+    part, exact_mm = seen(sphere)
+    half = np.where(RAYS[0] < sphere.surfaces[0].point_m[0] / 1.8, exact_mm, 0)
+    result = measure(sphere, part, exact_mm, half, RAYS)
+    assert result.refused == pytest.approx(0.5, abs=0.02) and abs(result.values["PS"]) < 1e-6
+    none = measure(sphere, part, exact_mm, np.zeros_like(exact_mm), RAYS)
+    assert none.refused == 1 and set(none.values.values()) == {None}
+
+
+class Far(Method):
+    """Answers with a plane."""
+
+    name, title, frames_used = "far", "far", (0,)
+
+    def predict(self, frames):
+        return np.full((RIG.camera.height, RIG.camera.width), 2000.0, np.float32)
+
+
+def test_a_certificate_judges_by_its_limits_and_says_what_it_is(few, tmp_path):
+    settings = scenes_of(RIG, "paper")
+    limits = {"PS": 5.0, "PF": 1e-6, "SD": 5.0}
+    test = certify(load_method("classical", RIG, steps=3), settings, "paper", 3, limits)
+    lines = {line.symbol: line for line in test.lines}
+    assert list(lines) == list(QUANTITIES)
+    assert [lines[symbol].verdict for symbol in ("PS", "PF", "SD", "F")] == [
+        "within",
+        "beyond",
+        "within",
+        "",
+    ]
+    assert abs(lines["PS"].largest) < 0.3 and 0 < lines["PF"].expanded < lines["PF"].largest
+    page, data = write_certificate(test, tmp_path)
+    text = page.read_text()
+    assert "nothing here is traceable" in text and "nothing conforms to a guideline" in text
+    assert "conforms to VDI" not in text
+    assert json.loads(data.read_text())["lines"][0]["symbol"] == "PF"
+
+
+def test_a_method_that_does_not_look_is_found_out(few):
+    test = certify(Far(RIG), scenes_of(RIG, "paper"), "paper", 2)
+    lines = {line.symbol: line for line in test.lines}
+    assert abs(lines["PS"].largest) > 30
+    assert abs(lines["W"].largest) > 20 and lines["F"].largest == pytest.approx(0, abs=1e-3)
+
+
+def test_what_cannot_be_tested_is_named(few, tmp_path, capsys):
+    far = Far(RIG)
+    far.units = "normalised"
+    with pytest.raises(PredictionError, match="gauges are measured in mm"):
+        certify(far, scenes_of(RIG, "paper"), "paper")
+    words = ["certify", "classical", "--out", str(tmp_path / "out")]
+    assert main([*words, "--limits", "PS:1"]) == 2
+    assert "--limits" in capsys.readouterr().err
+    assert main([*words, "--limits", "PQ=1"]) == 2
+    assert "limit of PQ: expected one of PF, PF95" in capsys.readouterr().err
+    assert main([*words, "--rig", str(tmp_path / "none.yaml")]) == 2
+    beside = replace(RIG, projector=replace(RIG.projector, cx=RIG.projector.cx + 3000))
+    with pytest.raises(BuildError, match="fits nowhere in the measuring volume"):
+        list(gauges(beside))
