@@ -17,6 +17,7 @@ from fpp_ml_bench.cli.options import AT_LEAST_ONE, Command, Row, flags_of, param
 from fpp_ml_bench.errors import FppBenchError, PredictionError
 from fpp_ml_bench.files import is_file
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import argument, flag_of, option, options_of
 
 if TYPE_CHECKING:
@@ -42,15 +43,16 @@ class MethodSettings:
     threads: int = option(1, "threads a sample (default: 1)", "N", parse=AT_LEAST_ONE)
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def load(self, dataset: "Photographed", warn: bool = True) -> Method:
-        """The method for the rig of ``dataset``. Unless told not to, warns on standard error about
+    def load(self, dataset: "Photographed | Rig", warn: bool = True) -> Method:
+        """The method for the rig of ``dataset``, or for a rig. Unless told not to, warns on standard error about
         weights that were trained on another version of the dataset's benchmark. Raises
         FppBenchError for an unknown method."""
         known = [entry.name for entry in fields(registry.find(self.name).method.Options)]
         threads = {"threads": self.threads} if "threads" in known else {}
         method = registry.load_method(self.name, dataset, **self.options, **threads)
         config = method.weights_config
-        warning = None if config is None else training_data_warning(config, dataset.manifest)
+        told = None if isinstance(dataset, Rig) else dataset.manifest
+        warning = None if config is None or told is None else training_data_warning(config, told)
         if warn and config is not None and warning is not None:
             print(f"warning: {config.name} was {warning}", file=sys.stderr)
         return method
