@@ -44,7 +44,7 @@ from fpp_ml_bench.baselines.method import Method, checked
 from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.projector_points import nearest_px
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.errors import CaptureError, PredictionError
+from fpp_ml_bench.errors import CaptureError, DecodeError, PredictionError
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.loaders.render.light import Light, load_light
@@ -153,19 +153,15 @@ def certify(
     errors by symbol; ``progress`` is called after every gauge. Raises `PredictionError` for a method
     whose answers are no millimetres and for a limit of an unknown quantity, `BuildError` for a rig
     in whose volume the gauges don't fit."""
-    if method.units != "mm":
-        raise PredictionError(
-            f"{method.title}: predicts normalised depth; gauges are measured in mm"
-        )
-    for symbol in limits or {}:
-        if symbol not in QUANTITIES:
-            raise PredictionError(f"limit of {symbol}: expected one of {', '.join(QUANTITIES)}")
+    _check(method, limits or {})
     studio, rig = Studio(settings), settings.rig
     unit_mm, volume = MM_PER_M * settings.object_scale, Volume.of(settings.unit_rig)
     found: list[Measured] = []
     repeats: dict[str, list[float]] = {}
     pictures: dict[str, Sequence[Picture]] = {}
     seconds: list[float] = []
+
+    used = method.frames_used or (0,)
 
     def answered(seen: _Seen, capture: int) -> Measured:
         frames = seen.frames(capture)
@@ -178,11 +174,11 @@ def certify(
         )
 
     for gauge in gauges(settings.unit_rig):
-        seen = _seen(studio, gauge, method.frames_used)
+        seen = _seen(studio, gauge, used)
         result = answered(seen, 0)
         found.append(result)
         if gauge.position == 0:
-            image = seen.frames(0)[method.frames_used[0]]
+            image = seen.frames(0)[used[0]]
             pictures[gauge.kind] = _pictures(seen.part >= 0, image, result.residual_mm)
             several = [result, *(answered(seen, number) for number in range(1, captures))]
             for symbol in result.values:
@@ -215,6 +211,8 @@ def _check(method: Method, limits: Mapping[str, float]) -> None:
         raise PredictionError(
             f"{method.title}: predicts normalised depth; gauges are measured in mm"
         )
+    if method.uses_ground_truth_mask:
+        raise PredictionError(f"{method.title}: is given the object's mask; a gauge gives none")
     for symbol in limits:
         if symbol not in QUANTITIES:
             raise PredictionError(f"limit of {symbol}: expected one of {', '.join(QUANTITIES)}")
@@ -247,7 +245,10 @@ def certify_board(
                 f"of {rig.camera.width} x {rig.camera.height} px; give the rig that took them"
             )
         started = perf_counter()
-        depth = method.answer(list(grey)).depth.astype(np.float64)
+        try:
+            depth = method.answer(list(grey)).depth.astype(np.float64)
+        except DecodeError as error:
+            raise PredictionError(f"{folder}: {error}") from error
         seconds.append(perf_counter() - started)
         lit = rig.sequence.white
         image = grey[lit] if lit is not None else np.rint(grey.mean(axis=0)).astype(np.uint8)

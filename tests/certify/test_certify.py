@@ -230,6 +230,13 @@ def test_what_cannot_be_tested_is_named(few, tmp_path, capsys):
     far.units = "normalised"
     with pytest.raises(PredictionError, match="gauges are measured in mm"):
         certify(far, scenes_of(RIG, "paper"), "paper")
+    far.units, far.uses_ground_truth_mask = "mm", True
+    with pytest.raises(PredictionError, match="is given the object's mask"):
+        certify(far, scenes_of(RIG, "paper"), "paper")
+    constant = certify(
+        load_method("constant", RIG, at="standoff"), scenes_of(RIG, "paper"), "paper", 1
+    )
+    assert constant.lines[0].largest > 10
     words = ["certify", "classical", "--out", str(tmp_path / "out")]
     assert main([*words, "--limits", "PS:1"]) == 2
     assert "--limits" in capsys.readouterr().err
