@@ -1,6 +1,7 @@
 """``fpp-bench certify``: a simulated type test of a method on a rig."""
 
 from collections.abc import Mapping
+from math import inf
 from pathlib import Path
 
 from fpp_ml_bench.baselines.certify.certificate import (
@@ -70,7 +71,11 @@ def certify_method(
         None,
         "largest permitted errors, to be judged, such as PS=0.5,SD=1",
         "LIST",
-        parse=value("symbols and numbers such as PS=0.5,SD=1", _limits),
+        parse=value(
+            "symbols and numbers above 0 such as PS=0.5,SD=1",
+            _limits,
+            lambda limits: bool(limits) and all(0 < limit < inf for limit in limits.values()),
+        ),
     ),
 ) -> None:
     """Test a method on gauges: probing error, sphere spacing, flatness, steps, with uncertainty.

@@ -240,6 +240,8 @@ def test_what_cannot_be_tested_is_named(few, tmp_path, capsys):
     words = ["certify", "classical", "--out", str(tmp_path / "out")]
     assert main([*words, "--limits", "PS:1"]) == 2
     assert "--limits" in capsys.readouterr().err
+    assert main([*words, "--limits", "PS=nan"]) == 2
+    assert "numbers above 0" in capsys.readouterr().err
     assert main([*words, "--limits", "PQ=1"]) == 2
     assert "limit of PQ: expected one of PF, PF95" in capsys.readouterr().err
     assert main([*words, "--rig", str(tmp_path / "none.yaml")]) == 2
