@@ -333,9 +333,9 @@ def _pictures(
         cut = padded[row : row + 2 * side, column : column + 2 * side]
         return cv2.resize(cut, (THUMBNAIL_PX,) * 2, interpolation=cv2.INTER_NEAREST)
 
-    assert image is not None
+    shown = np.zeros_like(residual_mm) if image is None else image
     return [
-        Picture(square(image), high=GREY_LEVELS),
+        Picture(square(shown), high=GREY_LEVELS),
         Picture(square(residual_mm), ERROR_COLOURS, -most, most),
     ]
 
