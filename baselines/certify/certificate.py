@@ -6,7 +6,7 @@ Nothing here is traceable to a standard of length, and nothing conforms to a gui
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import fmean, median, stdev
@@ -304,11 +304,14 @@ def _seen(studio: Studio, gauge: Gauge, used: Sequence[int]) -> _Seen:
     part.ravel()[hits.pixels] = gauge.part[hits.triangle]
     exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M * studio.settings.object_scale
     distance_m = float(gauge.mesh.vertices_m[:, 2].mean())
+    seed, name = studio.settings.seed, gauge.mesh.name
+    scene = studio.lit(gauge.mesh, traced, hits, distance_m, 0.0, np.zeros(3), (seed, name, 0))
 
     def frames(capture: int) -> list[NDArray[np.uint8] | None]:
-        stream = (studio.settings.seed, gauge.mesh.name, capture)
-        scene = studio.lit(gauge.mesh, traced, hits, distance_m, 0.0, np.zeros(3), stream)
-        studio.expose(scene, tuple(used))
+        # Captures differ in their exposure and noise, not in their light.
+        stream = (seed, name, capture)
+        again = replace(scene, stream=stream, brightness=studio.brightness(stream))
+        studio.expose(again, tuple(used))
         taken: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
         for index in used:
             taken[index] = studio.frame(index).copy()

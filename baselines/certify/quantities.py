@@ -15,9 +15,10 @@ from scipy.optimize import least_squares
 
 from fpp_ml_bench.baselines.certify.gauges import Gauge, Surface
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 
 Points = NDArray[np.float64]
-CROP_PX = 3
+CROP_PX = EDGE_BAND_PX
 """Pixels beside the border of a part mix surfaces: they are cropped."""
 REJECTED = 0.003
 """Share of the points that a fit may leave out: 3 in 1000, as VDI/VDE 2634 part 2 is said to."""
