@@ -132,7 +132,7 @@ class Certificate:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """A gauge before the camera: which of its surfaces a pixel sees, and the true depth there."""
 
     gauge: Gauge
@@ -163,7 +163,7 @@ def certify(
 
     used = method.frames_used or (0,)
 
-    def answered(seen: _Seen, capture: int) -> Measured:
+    def answered(seen: Seen, capture: int) -> Measured:
         frames = seen.frames(capture)
         started = perf_counter()
         answer = method.answer(frames)
@@ -174,7 +174,7 @@ def certify(
         )
 
     for gauge in gauges(settings.unit_rig):
-        seen = _seen(studio, gauge, used)
+        seen = before_camera(studio, gauge, used)
         result = answered(seen, 0)
         found.append(result)
         if gauge.position == 0:
@@ -296,7 +296,7 @@ def certify_board(
     )
 
 
-def _seen(studio: Studio, gauge: Gauge, used: Sequence[int]) -> _Seen:
+def before_camera(studio: Studio, gauge: Gauge, used: Sequence[int]) -> Seen:
     rig, traced = studio.rig, TracedGauge(gauge)
     hits = traced.primary(PixelRays.of(rig.camera))
     shape = (rig.camera.height, rig.camera.width)
@@ -317,7 +317,7 @@ def _seen(studio: Studio, gauge: Gauge, used: Sequence[int]) -> _Seen:
             taken[index] = studio.frame(index).copy()
         return taken
 
-    return _Seen(gauge, part, exact_mm, frames)
+    return Seen(gauge, part, exact_mm, frames)
 
 
 def _pictures(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fpp_ml_bench.calibration.result import VolumeError, volume_error_mm
+from fpp_ml_bench.calibration.volume import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
 from fpp_ml_bench.cli.options import SPLITS, command, new_file

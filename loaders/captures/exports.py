@@ -333,6 +333,7 @@ def write_capture(
         noise_grey=result.noise_grey,
         noise_measured=result.noise_measured,
         median_sigma_mm=float(np.median(sigma_mm[valid])),
+        median_sigma_mm_by_source=dict(result.budget_mm),
         notes=list(result.notes),
         reasons={reason.name.lower(): int(reason) for reason in Reason},
     )

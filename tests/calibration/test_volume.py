@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.calibration.projector_points import measure_pose
-from fpp_ml_bench.calibration.result import Lens, volume_error_mm
+from fpp_ml_bench.calibration.result import Lens
 from fpp_ml_bench.calibration.solve import calibrate
+from fpp_ml_bench.calibration.volume import volume_error_mm
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.loaders.captures.images import read_frames
