@@ -52,6 +52,8 @@ from fpp_ml_bench.loaders.published.importing import Source
 from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
 from fpp_ml_bench.loaders.storage.card import NAME, RIG_FILE, front_matter
+from fpp_ml_bench.loaders.storage.croissant import FILE as CROISSANT_FILE
+from fpp_ml_bench.loaders.storage.croissant import croissant
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, damage_of
 from fpp_ml_bench.loaders.storage.parquet import (
     card_configs,
@@ -510,6 +512,7 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
 def stage_dataset(
     dataset: DatasetFolder,
     repo: str,
+    licence: str,
     folder: Path,
     texts: Mapping[str, str],
     threads: int = 1,
@@ -532,6 +535,9 @@ def stage_dataset(
         shutil.copyfile(dataset.path / mesh.path, folder / mesh.path)
     save_rig(dataset.rig, folder / RIG_FILE)
     write_atomically(folder / PICTURE, overview(dataset))
+    features, splits = published_features(dataset), list(dataset.splits)
+    metadata = croissant(dataset.manifest, features, splits, licence, repo)
+    write_atomically(folder / CROISSANT_FILE, metadata)
     for name, text in texts.items():
         write_atomically(folder / name, text.encode())
     about = {

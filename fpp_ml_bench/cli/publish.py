@@ -100,7 +100,9 @@ def publish_dataset(
         try:
             with progress_bar("preparing", rows, "samples") as advance:
                 stage = hub_client.stage_dataset
-                publication = stage(opened, target.repo, folder, texts, usable_cores(), advance)
+                publication = stage(
+                    opened, target.repo, licence, folder, texts, usable_cores(), advance
+                )
         except OSError as error:
             raise PublishError(
                 f"can't put the files together in {folder} ({error.strerror or error}); free some "

@@ -2,6 +2,8 @@
 opens."""
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,7 @@ import scipy.io
 import trimesh
 from conftest import TINY_CONFIGS, TINY_OBJECTS, file_bytes
 from published_trees import command, imported, write_png
+from scored_dataset import make_dataset
 
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
 from fpp_ml_bench.files import whole_folder
@@ -346,3 +349,26 @@ def test_bad_input_to_the_command_is_a_message_and_status_2(
     assert command("export", *(word.format(data=tiny) for word in words)) == 2
     message = capsys.readouterr().err
     assert "error:" in message and "Traceback" not in message and not Path("out").exists()
+
+
+READ_ROWS = """
+import sys, mlcroissant, numpy as np
+read = mlcroissant.Dataset(sys.argv[1] + "/croissant.json")
+assert not read.metadata.ctx.issues.report()
+assert read.metadata.data_limitations and read.metadata.data_use_cases
+rows = list(read.records("test-rows"))
+depths = {row["test-rows/sample"].decode(): row["test-rows/depth"] for row in rows}
+np.savez(sys.argv[1] + "/read.npz", **{name: np.array(list(d)) for name, d in depths.items()})
+"""
+
+
+def test_croissant_metadata_is_valid_and_reads_the_rows(tmp_path):
+    """In a process of its own: where ``datasets`` is imported, its types of arrays stop pandas, by
+    which mlcroissant reads."""
+    dataset = make_dataset(tmp_path / "dataset", size=(12, 16))
+    export(dataset, tmp_path / "out", ["parquet"], ["test"])
+    words = [sys.executable, "-c", READ_ROWS, str(tmp_path / "out")]
+    subprocess.run(words, check=True, capture_output=True, timeout=120)
+    with np.load(tmp_path / "out" / "read.npz") as read:
+        assert list(read) == dataset.samples("test")
+        assert all(np.array_equal(read[name], dataset.depth_mm(name)) for name in read)
