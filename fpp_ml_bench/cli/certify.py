@@ -13,7 +13,6 @@ from fpp_ml_bench.baselines.certify.certificate import (
     write_certificate,
 )
 from fpp_ml_bench.baselines.certify.gauges import gauges
-from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.calibration.boards import parse_board
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.diagnose import Scenes
@@ -96,7 +95,7 @@ def certify_method(
                 method, calibrated, folders, parse_board(board), colour, limits, advance
             )
     else:
-        name = rig or find(chosen.name).method.scenes_rig(chosen.options)
+        name = rig or chosen.method.scenes_rig(chosen.options)
         settings = scenes_of(
             NAMED_RIGS[name]() if name in NAMED_RIGS else load_rig(Path(name)), light
         )

@@ -21,7 +21,6 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 from fpp_ml_bench.baselines.diagnostics.probe import diagnose as run_diagnosis
 from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.baselines.robustness.axes import CACHE, CLEAN, SETS, Condition, severity_means
 from fpp_ml_bench.baselines.robustness.run import Setup, View, write_page
 from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
@@ -261,7 +260,7 @@ def robust(
     workers = pool.processes
     if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    rig = find(chosen.name).method.scenes_rig(chosen.options)
+    rig = chosen.method.scenes_rig(chosen.options)
     settings = Condition(CLEAN, 0, SETS[objects], size, rig).settings
     method = chosen.load(Scenes.of(settings), warn=False)
     entry = None if into is None else read_entry(into)
