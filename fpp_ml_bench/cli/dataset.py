@@ -312,14 +312,14 @@ def export(
         "patterns": patterns,
     }
     forms = [form for form in FORMS if wanted[form]]
+    if predictions is not None and (not maps or split == "all"):
+        raise BuildError("--predictions: needs --maps, and --split with the split they are of")
     if not forms:
         raise BuildError(
             "nothing to export: give at least one of --parquet, --mat, --maps, --meshes, --patterns"
         )
     opened = DatasetFolder(dataset)
     splits = chosen_splits(opened, split)
-    if predictions is not None and (not maps or len(splits) > 1):
-        raise BuildError("--predictions: needs --maps, and --split with the split they are of")
     target = DEPTH_EXACT if opened.has_exact else DEPTH
 
     def depth_mm(sample: str) -> NDArray[Any]:
