@@ -35,9 +35,8 @@ class MethodSettings:
     gives, by the names of its fields."""
 
     name: str = argument(
-        "one of those below with their options, the name of weights that come with the package, a "
-        ".safetensors file, a "
-        "recipe that fpp-bench reproduce has trained (loss/l1), hf://OWNER/NAME, a model of the "
+        "one of those below, the name of weights that come with the package, a .safetensors file, "
+        "a recipe that fpp-bench reproduce has trained (loss/l1), hf://OWNER/NAME, a model of the "
         "Hub, or file.py:Class, a method of yours; that file is executed",
         "METHOD",
     )
@@ -145,12 +144,20 @@ class MethodCommand(Command):
         return [*super().get_params(ctx), *ctx.meta.get(_OF_METHODS, ())]
 
     def sections(self, ctx: click.Context) -> dict[str, list[Row]]:
+        """The options of the method that the command line names; without one, what methods there
+        are."""
         sections = super().sections(ctx)
-        for method in self.methods(ctx.obj).values():
-            params = [parameter_of(entry) for entry in self.fields_of(method).values()]
-            sections[f"{label_of(method)} ({method.purpose})"] = [
-                row_of(p, ctx) for p in params
-            ] or NO_OPTIONS
+        methods = self.methods(ctx.obj)
+        named = next((word for word in ctx.obj if methods.get(word) is not None), None)
+        if named is None:
+            how = f"methods ({ctx.command_path} METHOD --help shows the options of one)"
+            sections[how] = [(label_of(method), method.purpose) for method in methods.values()]
+            return sections
+        method = methods[named]
+        params = [parameter_of(entry) for entry in self.fields_of(method).values()]
+        sections[f"{label_of(method)} ({method.purpose})"] = [
+            row_of(p, ctx) for p in params
+        ] or NO_OPTIONS
         return sections
 
     def invoke(self, ctx: click.Context) -> int:
