@@ -22,6 +22,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fpp_ml_bench.baselines.from_hub import FILE_MARK, SCHEME, fetched
 from fpp_ml_bench.baselines.method import Method, Photographed, Setting, is_built_in
 from fpp_ml_bench.errors import FppBenchError, PredictionError, WeightsError
 from fpp_ml_bench.files import is_file, printable
@@ -31,8 +32,6 @@ from fpp_ml_bench.options import did_you_mean
 
 GROUP = "fpp_ml_bench.methods"
 PACKAGE = __name__.partition(".")[0]
-FILE_MARK = ".py:"
-"""What tells ``mine.py:Mine`` from a name."""
 BUILT_IN = (
     "classical:ClassicalMethod",
     "phase.method:PhaseMethod",
@@ -42,6 +41,8 @@ BUILT_IN = (
     "trivial:NearestMethod",
 )
 """The classes of this package, below `fpp_ml_bench.baselines`. Their names are their own."""
+NEEDED = ("name", "title", "frames_used")
+"""What a method has beside `predict` or `answer`."""
 NETWORKS = "networks.network_method:NetworkMethod"
 """The class that trained networks from image to depth are made with, by their weights."""
 
@@ -81,18 +82,23 @@ def network_method() -> type[Method]:
     return _built_in(NETWORKS)
 
 
-def find(name: str | Path) -> Found:
+def find(name: str | Path, trust: bool = False) -> Found:
     """The class that ``name`` means: a method's name, ``file.py:Class`` (the file is executed), or
     weights that come with the package or in a ``.safetensors`` file, or a recipe that ``fpp-bench
-    reproduce`` has trained. Raises `PredictionError`, for an unknown name with what it might have
+    reproduce`` has trained, or ``hf://OWNER/NAME``, a repository of the Hub, whose code is executed
+    only with ``trust``. Raises `PredictionError`, for an unknown name with what it might have
     meant."""
     text = str(name)
+    if text.startswith(SCHEME):
+        place = fetched(text, trust)
+        found = find(place.name)
+        return Found(found.method, {**found.options, **place.options})
     if text.endswith(".py"):
         text += ":"
     if FILE_MARK in text:
         method = _checked(load_from_file(text), text)
         path, _, attribute = text.rpartition(":")
-        _let_workers_have(method, f"{Path(path).resolve()}:{attribute}")
+        _let_workers_have(method, f"{Path(path).absolute()}:{attribute}")
         return Found(method, {})
     known = methods()
     if text in known:
@@ -117,7 +123,9 @@ def find(name: str | Path) -> Found:
         ) from None
 
 
-def load_method(name: str | Path, source: Photographed | Rig, **options: Any) -> Method:
+def load_method(
+    name: str | Path, source: Photographed | Rig, *, trust: bool = False, **options: Any
+) -> Method:
     """The method that ``name`` means (see `find`), for a dataset, or for images of a rig.
 
     ``options`` are the fields of its class's ``Options``; a network also takes ``device`` (``cpu``, ``cuda``, ...).
@@ -127,7 +135,7 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights,
     invalid options.
     """
-    method, preset = find(name)
+    method, preset = find(name, trust)
     own_answer = method.answer is not Method.answer
     if method.predict is Method.predict and not own_answer:
         raise PredictionError(f"{name}: does not define predict, or answer, which a method needs")
@@ -137,13 +145,20 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
         )
     shown = source.without_truth() if isinstance(source, DatasetFolder) else source
     make = method.for_rig if isinstance(shown, Rig) else method.for_dataset
-    made = make(shown, **preset, **options)  # type: ignore[arg-type]
+    made = make(shown, **{**preset, **options})  # type: ignore[arg-type]
+    if missing := [key for key in NEEDED if not hasattr(made, key)]:
+        raise PredictionError(
+            f"{name}: has no {missing[0]}, which a method needs; set it in the class: "
+            f"name, title, frames_used = 'mine', 'what it is called in a table', (0,)"
+        )
     given = {**{entry.name: entry.default for entry in fields(method.Options)}, **options}
     files = {key: Path(value) for key, value in given.items() if isinstance(value, str | Path)}
     settings: dict[str, Setting] = {
         f"{key}_sha256": _sha256(path) for key, path in files.items() if is_file(path)
     }
     settings |= made.settings
+    if str(name).startswith(SCHEME):
+        settings["repository"] = fetched(str(name), trust).source
     if (digest := source_sha256(method)) is not None:
         made.code, settings["source_sha256"] = code_of(method), digest
     try:
@@ -159,7 +174,7 @@ def load_from_file(text: str) -> Any:
     """The object that ``file.py:name`` means; the file is executed once. `PredictionError` where
     that fails."""
     path_text, _, name = text.rpartition(":")
-    module = _module_of(Path(path_text).resolve())
+    module = _module_of(Path(path_text).absolute())
     try:
         return getattr(module, name)
     except AttributeError:

@@ -136,7 +136,7 @@ def run_fringes(scene: Scene, repeats: int) -> list[Row]:
     try:
         from fringes import Fringes
     except ImportError:
-        print("fringes is not installed (pip install 'fpp-ml-bench[benchmarks]'): left out")
+        print("fringes is not installed (pip install --group peers): left out")
         return []
     logging.getLogger("fringes").setLevel(
         logging.ERROR

@@ -20,7 +20,7 @@ is compared, and "seeds" is how far they differ. A mean grey level is that of th
   pixel by pixel. Each within 20%, or within a milliradian.
 
 Seconds are of one core. Exit status 1 if an agreement is missed. Needs ``pip install
-'fpp-ml-bench[pathtrace]'``.
+--group pathtrace``.
 """
 
 import argparse
@@ -389,10 +389,7 @@ def camera_rows() -> list[str]:
     try:
         from fringes.util import fade
     except ImportError:
-        return [
-            "fringes is not installed (pip install 'fpp-ml-bench[benchmarks]'): its camera is left "
-            "out"
-        ]
+        return ["fringes is not installed (pip install --group peers): its camera is left out"]
     camera = named_light("paper").camera
     electrons = camera.full_well_e or np.inf
     sensor, gain = Sensor.of(camera), 255 / electrons
@@ -521,7 +518,7 @@ def main() -> int:
     try:
         import mitsuba as mi
     except ImportError:
-        sys.exit("Mitsuba is not installed: pip install 'fpp-ml-bench[pathtrace]'")
+        sys.exit("Mitsuba is not installed: pip install --group pathtrace")
     mi.set_variant("scalar_rgb")
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:

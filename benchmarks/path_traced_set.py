@@ -9,7 +9,7 @@ Two views of six unseen objects before the paper's rig with crossed fringes. Lig
 place are those of the light ``paper`` with shadows and an even screen; the frame has all bounces of
 a path tracer, our ambient light and our sensor's noise, the depth is that of our ray cast. Also
 printed: how far a frame of ours is from Mitsuba's without noise, as a share of its mean grey level.
-Needs ``pip install 'fpp-ml-bench[pathtrace]'``; a minute a view on one core at 960 px.
+Needs ``pip install --group pathtrace``; a minute a view on one core at 960 px.
 """
 
 import argparse

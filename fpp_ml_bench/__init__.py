@@ -13,7 +13,9 @@ from importlib.machinery import ModuleSpec as _ModuleSpec
 from importlib.machinery import PathFinder as _PathFinder
 from pathlib import Path as _Path
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
+RELEASED = "2026-11-28"
+"""Date of the release, as in CITATION.cff."""
 
 _ROOT = _Path(__file__).resolve().parent.parent
 _ROOMS = frozenset(

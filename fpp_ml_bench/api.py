@@ -67,16 +67,21 @@ def open_dataset(folder: str | Path) -> "DatasetFolder":
     return DatasetFolder(folder)
 
 
-def load_method(name: str | Path, dataset: "DatasetFolder", **options: Any) -> "Method":
+def load_method(
+    name: str | Path, dataset: "DatasetFolder", *, trust: bool = False, **options: Any
+) -> "Method":
     """A method that turns frames into depth, ready for a dataset's rig and image size.
 
     Parameters
     ----------
     name : str or Path
         ``classical``, ``phase``, ``crossed`` and the other methods of ``fpp-bench predict``, a class of yours as
-        ``mine.py:Mine``, shipped weights, or a ``.safetensors`` file.
+        ``mine.py:Mine``, shipped weights, a ``.safetensors`` file, or ``hf://OWNER/NAME``, a model repository of the
+        Hugging Face Hub.
     dataset : DatasetFolder
         What it is to run on; see `open_dataset`.
+    trust : bool
+        Whether code that a repository of the Hub brings may run.
     **options
         The method's settings: ``steps=4`` (classical), ``frames=3`` (phase), ``direction="vertical"`` (both),
         ``frame=7`` (networks).
@@ -102,7 +107,7 @@ def load_method(name: str | Path, dataset: "DatasetFolder", **options: Any) -> "
     """
     from fpp_ml_bench.baselines import registry
 
-    return registry.load_method(name, dataset, **options)
+    return registry.load_method(name, dataset, trust=trust, **options)
 
 
 def decode(

@@ -15,6 +15,7 @@ import io
 import json
 import math
 import os
+import re
 import resource
 import struct
 import subprocess
@@ -563,3 +564,36 @@ def _read_table(content: bytes, largest: int, most_values: int) -> Answer:
 
 if __name__ == "__main__":
     _serve(int(sys.argv[1]))
+
+
+_PFM = re.compile(rb"Pf\s+(\d{1,6})\s+(\d{1,6})\s+(-?\d+(?:\.\d+)?)\s")
+"""The head of a portable float map of one channel; a scale below 0 says little-endian."""
+
+
+def pfm_bytes(values: NDArray) -> bytes:
+    """A map (H, W) as a portable float map (PFM): float32, rows from the last to the first."""
+    height, width = values.shape
+    rows = np.ascontiguousarray(values[::-1], "<f4")
+    return b"Pf\n%d %d\n-1.0\n" % (width, height) + rows.tobytes()
+
+
+def pfm_size(content: bytes) -> tuple[int, int] | None:
+    """Height and width in px that a PFM states; None for content that begins as none."""
+    head = _PFM.match(content)
+    return None if head is None else (int(head[2]), int(head[1]))
+
+
+def parse_pfm(content: bytes) -> NDArray[np.float32]:
+    """The map (H, W) of a PFM; `PredictionError` for content that is none, or cut off."""
+    head = _PFM.match(content)
+    if head is None or float(head[3]) == 0:
+        raise PredictionError("is no PFM file of one channel; expected Pf, width, height, -1.0")
+    width, height = int(head[1]), int(head[2])
+    expected, got = 4 * width * height, len(content) - head.end()
+    if got != expected:
+        raise PredictionError(
+            f"holds {got} bytes of values, expected {expected} of {width} x {height}"
+        )
+    order = "<f4" if float(head[3]) < 0 else ">f4"
+    values = np.frombuffer(content, order, offset=head.end()).reshape(height, width)
+    return values[::-1].astype(np.float32)

@@ -7,7 +7,10 @@ millimetres are in the notes. Own definition; 10 mm is the widest tolerance that
 counts pixels within.
 """
 
+import json
+import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,8 +18,11 @@ from urllib.parse import urlsplit
 from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
 from fpp_ml_bench import __version__
+from fpp_ml_bench.baselines.from_hub import CONFIG, FILE_MARK, KEY, WEIGHTS
+from fpp_ml_bench.baselines.registry import code_of, find
+from fpp_ml_bench.baselines.training.weights import open_weights
 from fpp_ml_bench.constants import CONFIGS
-from fpp_ml_bench.errors import PublishError
+from fpp_ml_bench.errors import PredictionError, PublishError
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import given_truth
@@ -71,6 +77,16 @@ Fingerprint of the dataset: `{fingerprint}`. Written by fpp-ml-bench {package}.
 {end}"""
 
 
+_METHOD = """\
+# {repo}
+
+A method of fringe projection profilometry for [fpp-ml-bench](https://pypi.org/project/fpp-ml-bench): {words}.
+
+```bash
+fpp-bench predict hf://{repo} DATASET --out predictions{run}
+fpp-eval predictions DATASET
+```
+"""
 TRACKS: tuple[Track, ...] = ("metric", "oracle range")
 """Those that have tasks on the Hub; each has one for a frame and one for more."""
 
@@ -243,7 +259,49 @@ def stage_results(
         (folder / RESULT_FOLDER / name).write_bytes(
             yaml_text(eval_result_entries_to_yaml([published])).encode()
         )
-    return Publication("model", repo, folder, f"{NAME} results: {', '.join(named)}")
+    return Publication("model", repo, folder, f"{NAME} results: {', '.join(named)}", whole=False)
+
+
+def stage_method(name: str, repo: str, folder: Path) -> Publication:
+    """Write what ``load_method("hf://REPO")`` needs into ``folder``: trained weights with their
+    configuration, or the files of ``mine.py:Mine``. Raises `PredictionError` and `WeightsError` for
+    what is neither, and for code that reads files from elsewhere."""
+    found = find(name)
+    entry: dict[str, Any] = {}
+    config: dict[str, Any] = {}
+    if FILE_MARK in name:
+        file, _, attribute = name.rpartition(":")
+        for part in code_of(found.method):
+            if ".." in Path(part).parts:
+                raise PredictionError(
+                    f"{name}: uses {part}, which lies outside its folder; put it beside the file"
+                )
+            (folder / part).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(Path(file).parent / part, folder / part)
+        entry["method"] = f"{Path(file).name}:{attribute}"
+        words, run = f"`{entry['method']}`, code that `--trust` allows to run", " --trust"
+    else:
+        path = found.options.get("weights")
+        if path is None:
+            raise PredictionError(
+                f"{name}: expected trained weights (a name, a recipe or a .safetensors file) or "
+                f"file.py:Class; a method of this package needs no repository"
+            )
+        weights = open_weights(Path(path))
+        shutil.copyfile(weights.path, folder / WEIGHTS)
+        config = json.loads(json.dumps(asdict(weights.config)))
+        words, run = f"{weights.config.title}, safetensors `{weights.sha256[:12]}`", ""
+    (folder / CONFIG).write_text(json.dumps({KEY: entry, **config}, indent=1) + "\n", "utf-8")
+    head = {
+        "license": "mit",
+        "library_name": FRAMEWORK,
+        "pipeline_tag": "depth-estimation",
+        "tags": ["fringe-projection-profilometry", "structured-light", FRAMEWORK],
+    }
+    body = _METHOD.format(repo=repo, words=words, run=run)
+    (folder / CARD_FILE).write_bytes(f"---\n{yaml_text(head)}---\n{body}".encode())
+    (folder / MARK).write_bytes(mark_bytes("method"))
+    return Publication("model", repo, folder, f"{NAME} method: {printable(name, 80)}")
 
 
 def _notes(entry: Entry) -> str:

@@ -52,6 +52,8 @@ from fpp_ml_bench.loaders.published.importing import Source
 from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
 from fpp_ml_bench.loaders.storage.card import NAME, RIG_FILE, front_matter
+from fpp_ml_bench.loaders.storage.croissant import FILE as CROISSANT_FILE
+from fpp_ml_bench.loaders.storage.croissant import croissant
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, damage_of
 from fpp_ml_bench.loaders.storage.parquet import (
     card_configs,
@@ -101,13 +103,15 @@ class Unreachable(PublishError, RemoteError):
 class Publication:
     """Files staged for a repository; every file below ``folder`` is part of it, hidden files
     included. ``owned`` are folders (ending in ``/``) that only this publication fills: any other
-    file in them is deleted. ``message`` is the commit message."""
+    file in them is deleted. ``message`` is the commit message. ``whole``: it fills the repository,
+    and does not add to one of somebody."""
 
     kind: Kind
     repo: str
     folder: Path
     message: str
     owned: tuple[str, ...] = ()
+    whole: bool = True
 
 
 @dataclass(frozen=True)
@@ -183,7 +187,7 @@ def _status(path: Path, stored: RepoFile | None) -> Status:
 def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> None:
     """Refuse, with `PublishError`, to write into a repository that this command did not fill,
     unless ``adopt``."""
-    if adopt or publication.kind == "model" or not remote.exists:
+    if adopt or not publication.whole or not remote.exists:
         return
     foreign = sorted(
         set(remote.files) - {".gitattributes", "README.md"}
@@ -279,12 +283,12 @@ class Hub:
                 raise TypeError("files without names or sizes")
             return Remote(info.sha or "", bool(info.private), files)
 
-    def download(self, repo: str, commit: str, patterns: list[str]) -> Path:
-        """Download files of a dataset whose names match ``patterns`` into the client's cache, but
-        for those that are there; returns the folder of the commit in the cache."""
-        with self._explained(f"downloading dataset {repo}"):
+    def download(self, repo: str, commit: str, patterns: list[str], kind: Kind = "dataset") -> Path:
+        """Download files of a repository whose names match ``patterns`` into the client's cache,
+        but for those that are there; returns the folder of the commit in the cache."""
+        with self._explained(f"downloading {kind} {repo}"):
             folder = self._api.snapshot_download(
-                repo, repo_type="dataset", revision=commit, allow_patterns=patterns
+                repo, repo_type=kind, revision=commit, allow_patterns=patterns
             )
         return Path(folder)
 
@@ -510,6 +514,7 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
 def stage_dataset(
     dataset: DatasetFolder,
     repo: str,
+    licence: str,
     folder: Path,
     texts: Mapping[str, str],
     threads: int = 1,
@@ -532,6 +537,9 @@ def stage_dataset(
         shutil.copyfile(dataset.path / mesh.path, folder / mesh.path)
     save_rig(dataset.rig, folder / RIG_FILE)
     write_atomically(folder / PICTURE, overview(dataset))
+    features, splits = published_features(dataset), list(dataset.splits)
+    metadata = croissant(dataset.manifest, features, splits, licence, repo)
+    write_atomically(folder / CROISSANT_FILE, metadata)
     for name, text in texts.items():
         write_atomically(folder / name, text.encode())
     about = {

@@ -12,11 +12,14 @@ from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
+import lock
 import pytest
 import setuptools
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import fpp_ml_bench
 from fpp_ml_bench.cli import COMMANDS, EVAL, EXTRAS
 
 pytestmark = pytest.mark.long
@@ -293,3 +296,28 @@ def test_constraints_pin_what_every_extra_brings():
                 ):
                     waiting.append(needed)
     assert not problems
+
+
+def test_constraints_are_those_of_the_lock_file():
+    assert (
+        lock.constraints((ROOT / "pylock.toml").read_text())
+        == (ROOT / "constraints.txt").read_text()
+    )
+    packages = tomllib.loads((ROOT / "pylock.toml").read_text())["packages"]
+    for package in packages:
+        files = [*package.get("wheels", ()), *filter(None, [package.get("sdist")])]
+        assert files and all(file["hashes"]["sha256"] for file in files), package["name"]
+        assert all(file["url"].startswith("https://") for file in files), package["name"]
+    names = {package["name"] for package in packages}
+    assert "opencv-contrib-python-headless" in names and "opencv-contrib-python" not in names
+
+
+def test_one_version_and_one_date_of_the_release():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    preferred = citation["preferred-citation"]["version"]
+    assert {citation["version"], preferred, project["version"]} == {fpp_ml_bench.__version__}
+    assert citation["date-released"] == fpp_ml_bench.RELEASED
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    title = f"## {fpp_ml_bench.__version__} - {fpp_ml_bench.RELEASED}\n"
+    assert title in changelog and len(changelog.splitlines()) <= 80

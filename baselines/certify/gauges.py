@@ -21,7 +21,6 @@ from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 
 Vector = NDArray[np.float64]
 Kind = Literal["sphere", "ball bar", "plane", "step", "wedge"]
-KINDS: tuple[Kind, ...] = ("sphere", "ball bar", "plane", "step", "wedge")
 DIAMETER = 0.12
 """Of a sphere, over the diagonal of the volume: VDI/VDE 2634 part 2 is said to ask for 0.1 to
 0.2."""

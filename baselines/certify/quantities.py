@@ -15,9 +15,10 @@ from scipy.optimize import least_squares
 
 from fpp_ml_bench.baselines.certify.gauges import Gauge, Surface
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 
 Points = NDArray[np.float64]
-CROP_PX = 3
+CROP_PX = EDGE_BAND_PX
 """Pixels beside the border of a part mix surfaces: they are cropped."""
 REJECTED = 0.003
 """Share of the points that a fit may leave out: 3 in 1000, as VDI/VDE 2634 part 2 is said to."""
@@ -52,6 +53,11 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity("F95", "flatness, 95%", "width of the layer of 95% of a plane's points"),
         Quantity("H", "step", "fitted height less the true one"),
         Quantity("W", "wedge", "fitted angle less the true one", "degrees"),
+        Quantity(
+            "L",
+            "lengths",
+            "distance of two corners of a board less the true one, of pairs half its diagonal apart and more",
+        ),
         Quantity("E", "edge response", "distance from 10 to 90% of a step's height", "px"),
     )
 }
@@ -118,6 +124,46 @@ def _kept(residual: NDArray[np.float64]) -> NDArray[np.bool_]:
     """All but the share `REJECTED` of the points, those furthest off."""
     off = np.abs(residual - np.median(residual))
     return np.asarray(off <= np.sort(off)[len(off) - 1 - int(REJECTED * len(off))])
+
+
+def corners_mm(
+    corners_px: NDArray[np.float64], points_mm: NDArray[np.float64], radius_px: float
+) -> NDArray[np.float64]:
+    """Points (n, 3) in mm at image points (n, 2) of a plane, float64, by the plane of the points
+    (H, W, 3) within a radius; NaN with fewer than half of them."""
+    found = np.full((len(corners_px), 3), np.nan)
+    row, column = np.mgrid[: points_mm.shape[0], : points_mm.shape[1]]
+    for number, (x, y) in enumerate(corners_px):
+        if not np.isfinite([x, y]).all():
+            continue
+        reach = int(np.ceil(radius_px))
+        window = (
+            slice(max(int(y) - reach, 0), int(y) + reach + 2),
+            slice(max(int(x) - reach, 0), int(x) + reach + 2),
+        )
+        near = np.hypot(column[window] - x, row[window] - y) <= radius_px
+        own, known = points_mm[window], np.isfinite(points_mm[window]).all(axis=-1) & near
+        if known.sum() < max(near.sum() / 2, 6):
+            continue
+        # Of a plane 1 / z is linear in the image, and so are x / z and y / z.
+        terms = np.column_stack(
+            [np.ones(known.sum()), column[window][known] - x, row[window][known] - y]
+        )
+        values = np.column_stack([1 / own[known][:, 2], own[known][:, :2] / own[known][:, 2:]])
+        inverse, across, down = np.linalg.lstsq(terms, values, rcond=None)[0][0]
+        found[number] = across / inverse, down / inverse, 1 / inverse
+    return found
+
+
+def lengths_off_mm(
+    found_mm: NDArray[np.float64], true_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """By how much distances between points (n, 3) differ from the true ones, of all pairs that are
+    half the largest true distance apart and more; NaN without one."""
+    first, second = np.triu_indices(len(true_mm), 1)
+    true = np.linalg.norm(true_mm[second] - true_mm[first], axis=1)
+    off = np.linalg.norm(found_mm[second] - found_mm[first], axis=1) - true
+    return np.asarray(off[(true >= true.max() / 2) & np.isfinite(off)])
 
 
 @dataclass(frozen=True)

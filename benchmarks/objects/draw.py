@@ -1,7 +1,7 @@
 """Draw the meshes that come with the package: the benchmark's 50 objects and the 20 of the set
 ``unseen``.
 
-    pip install -e ".[objects]"
+    pip install -U pip && pip install --group objects
     python benchmarks/objects/draw.py                      all, into loaders/render/objects.npz
     python benchmarks/objects/draw.py --check banana gear  do these drawings give the meshes that are there?
 

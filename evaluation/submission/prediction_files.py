@@ -18,7 +18,15 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from fpp_ml_bench.containers import PNG_GREY, parse_image, parse_matrix, parse_table, png_header
+from fpp_ml_bench.containers import (
+    PNG_GREY,
+    parse_image,
+    parse_matrix,
+    parse_pfm,
+    parse_table,
+    pfm_size,
+    png_header,
+)
 from fpp_ml_bench.depth import shape_problem, without_nodata
 from fpp_ml_bench.errors import FppBenchError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import LARGEST_MM
@@ -65,7 +73,7 @@ def read_plain_file(
     return content
 
 
-PER_SAMPLE = (".npy", ".npz", ".mat", ".png")
+PER_SAMPLE = (".npy", ".npz", ".mat", ".png", ".pfm")
 SIGMA = ".sigma.npy"
 """Of a sample's optional standard uncertainty, a map (H, W) in mm, 0 where none is stated."""
 TABLES = ("predictions.parquet", "predictions.arrow")
@@ -117,6 +125,8 @@ class Listing:
             content = read_bounded(path, _largest_npy(size) + spare_bytes)
             if self.form == ".png":
                 depth = parse_png(content, size, png_mm_per_level)
+            elif self.form == ".pfm":
+                depth = parse_pfm(content)
             else:
                 depth = (parse_npz if self.form == ".npz" else parse_mat)(content, size)
             return depth, hashlib.sha256(content).hexdigest()
@@ -250,13 +260,15 @@ def _largest_npy(size: tuple[int, int]) -> int:
 
 
 def declared_size(path: Path) -> tuple[int, int] | None:
-    """The size (H, W) that a .npy, .npz or .png file states; None where it states none. Nothing
+    """The size (H, W) that a .npy, .npz, .png or .pfm file states; None where it states none. Nothing
     else is checked."""
     with suppress(OSError, zipfile.BadZipFile, IndexError, *_NO_HEADER):
         with opened(path) as (stream, length):
             head = stream.read(min(HEADER_BYTES, length))
         if (header := png_header(head)) is not None:
             return header.size
+        if (of_pfm := pfm_size(head)) is not None:
+            return of_pfm
         if head.startswith(b"PK"):
             with zipfile.ZipFile(path) as archive, archive.open(archive.infolist()[0]) as member:
                 head = member.read(HEADER_BYTES)

@@ -1,8 +1,7 @@
 """What a calibration found: lens models, both devices, the pose between them, errors, and how sure
-it is of each; its residuals as a picture; and how far a rig's depth is from another's over the
-working volume."""
+it is of each; its residuals as a picture."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
-from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.optics.pinhole import Pinhole
-from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import AXES
-from fpp_ml_bench.style import DEPTH_COLOURS, figure, figure_png, styled
+from fpp_ml_bench.style import DEPTH_COLOURS, SIGMA_COLOURS, figure, figure_png, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,11 +37,6 @@ pose's held-out error is high."""
 SPOILER_SHARE = 1.2
 """Such a pose is named where its error in the fit is this many times the median, too: one that is
 only unlike the others predicts badly, but fits."""
-ACROSS = 24
-"""Points along each side of the image at which two rigs are compared: enough for a mean of smooth
-differences."""
-DEPTHS = 9
-"""Depths along the range at which they are compared."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +131,8 @@ class Calibration:
     the RMS of cv2.calibrateCamera for camera and projector each on its own with a perfect board.
     ``noise_px``: standard deviations of camera and projector coordinates that the residuals show,
     with whose inverse squares they were weighted. ``bic``: Bayesian information criterion.
+    ``root`` (k, f): the covariance of the k parameters, fx, fy, cx, cy and coefficients of camera and
+    projector, rotation vector and translation in mm, is its product with its transpose.
     ``board_mm``: the board's points (n, 3), estimated or given. ``doubts``: what is improbable, in
     sentences that begin with ``warning:``, or ``note:`` where it may well be right. Uncertainties
     take the residuals for independent: errors that all poses share, such as those of a board that
@@ -155,6 +148,7 @@ class Calibration:
     alone_rms_px: tuple[float, float]
     noise_px: tuple[float, float]
     bic: float
+    root: NDArray[np.float64] = field(repr=False, compare=False)
     board_mm: NDArray[np.float64] = field(repr=False, compare=False)
     poses: tuple[FittedPose, ...] = field(repr=False)
     doubts: tuple[str, ...] = ()
@@ -195,15 +189,18 @@ class Calibration:
 
 
 @styled
-def draw_residuals(calibration: Calibration) -> bytes:
+def draw_residuals(
+    calibration: Calibration, sigma_mm: Mapping[float, NDArray[np.float64]] | None = None
+) -> bytes:
     """PNG of a calibration: for camera and projector the residuals by pose and the points in the
-    image, and the RMS of each pose."""
+    image, and the RMS of each pose; and by three depths in mm what it leaves of the depth over the
+    image, ``sigma_mm`` (n, m), NaN beside the pattern."""
     from matplotlib import colormaps
 
-    poses = calibration.poses
+    poses, maps = calibration.poses, sigma_mm or {}
     colours = colormaps[DEPTH_COLOURS](np.linspace(0.05, 0.95, len(poses)))
-    drawn = figure(13, 8)
-    plots = drawn.subplots(2, 3)
+    drawn = figure(13, 12 if maps else 8)
+    plots = drawn.subplots(3 if maps else 2, 3)
     for row, (name, device) in enumerate(
         (("camera", calibration.camera.pinhole), ("projector", calibration.projector.pinhole))
     ):
@@ -230,6 +227,18 @@ def draw_residuals(calibration: Calibration) -> bytes:
         )
     _bars(plots[0, 2], calibration)
     plots[1, 2].axis("off")
+    most = max((np.nanquantile(sigma, 0.95, method="lower") for sigma in maps.values()), default=0)
+    camera = calibration.camera.pinhole
+    for axes, (depth_mm, sigma) in zip(plots[2] if maps else (), maps.items(), strict=True):
+        image = axes.imshow(
+            sigma,
+            SIGMA_COLOURS,
+            extent=(-0.5, camera.width - 0.5, camera.height - 0.5, -0.5),
+            vmin=0,
+            vmax=most,
+        )
+        drawn.colorbar(image, ax=axes, label="mm", extend="max")
+        axes.set(title=f"depth at {depth_mm:.0f} mm: standard uncertainty", xlabel="column, px")
     handles, labels = plots[0, 0].get_legend_handles_labels()
     plots[1, 2].legend(handles, labels, loc="upper left", ncols=1 + len(poses) // 20, markerscale=3)
     return figure_png(drawn, reduced=True)
@@ -251,70 +260,3 @@ def _bars(axes: "Axes", calibration: Calibration) -> None:
     axes.set_xticks(place, marks, rotation=90 if len(poses) > 6 else 20, fontsize=7)
     axes.set(title="RMS by pose, (!) fits the others badly", ylabel="px")
     axes.legend()
-
-
-class VolumeError(NamedTuple):
-    """Depth by one rig minus depth by the true one: ``rms_mm``, ``worst_mm``, and ``scale``, the
-    factor between the two by least squares (0.95 where a board's spacing was given 5% too
-    small)."""
-
-    rms_mm: float
-    worst_mm: float
-    scale: float
-
-
-def volume_error_mm(rig: Rig, true_rig: Rig) -> VolumeError:
-    """Depth error of ``rig`` where ``true_rig`` captures: a grid of points of the true working
-    range, seen from the centres of as many parts of the image, goes to image and projector px by
-    the true rig and back to depth by the other. Both are depths along the camera's axis, each of
-    its own. Points beside the pattern don't count.
-
-    Raises `CalibrationError` for images or patterns of different sizes, and where no point is left
-    or one has no depth by ``rig``."""
-    for device in ("camera", "projector"):
-        sizes = [
-            (part.width, part.height) for part in (getattr(rig, device), getattr(true_rig, device))
-        ]
-        if sizes[0] != sizes[1]:
-            (w, h), (true_w, true_h) = sizes
-            raise CalibrationError(
-                f"{device}: expected {true_w} x {true_h} px as in the true rig, got {w} x {h} px"
-            )
-    camera, projector = true_rig.camera, true_rig.projector
-    sides = (
-        (np.arange(ACROSS) + 0.5) * (length / ACROSS) - 0.5
-        for length in (camera.width, camera.height)
-    )
-    column, row = (axis.ravel() for axis in np.meshgrid(*sides))
-    x, y = camera.normalised(column, row)
-    near_m, far_m = (limit / MM_PER_M for limit in true_rig.working_range_mm)
-    depth_m = np.linspace(near_m, far_m, DEPTHS)[:, None]
-    u, v = true_rig.project(
-        np.stack([x * depth_m, y * depth_m, np.broadcast_to(depth_m, (DEPTHS, x.size))], axis=-1)
-    )
-    shown = (u >= -0.5) & (u <= projector.width - 0.5) & (v >= -0.5) & (v <= projector.height - 0.5)
-    if not shown.any():
-        raise CalibrationError(
-            "no point of the true rig's working range is on both image and pattern; check that rig"
-        )
-    rays = rig.camera.normalised(column, row)
-    if len(rig.directions) == 2:
-        weights = (
-            1.0 / true_rig.code(direction).sigma_px(1.0, 1.0) ** 2 for direction in AXES
-        )  # as the decoder's
-        found_mm = depth_from_both(rays, u, v, rig, *weights).depth_mm
-    else:
-        (direction,) = rig.directions
-        found_mm = depth_from_coordinate(rays, u if direction == "vertical" else v, rig, direction)
-    true_mm = np.broadcast_to(depth_m * MM_PER_M, u.shape)[shown]
-    found_mm = found_mm[shown]
-    lost = int(np.isnan(found_mm).sum())
-    if lost:
-        raise CalibrationError(
-            f"{lost} of {len(found_mm)} points of the true rig's working range have no depth by "
-            f"the other rig, so the "
-            "two have nothing in common; check rotation, translation and the sign of the axes"
-        )
-    error = found_mm - true_mm
-    scale = float((found_mm * true_mm).sum() / (true_mm * true_mm).sum())
-    return VolumeError(float(np.sqrt((error * error).mean())), float(np.abs(error).max()), scale)

@@ -332,6 +332,13 @@ def _result(
         alone,
         bundle.extra_px,
         _bic(bundle, x),
+        np.concatenate(
+            [
+                *(root[part] for part in (bundle.camera, bundle.projector)),
+                root[bundle.stereo][:3],
+                factor * of_shift,
+            ]
+        ),
         factor * x[bundle.board].reshape(-1, 3),
         tuple(fitted),
     )

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration.result import VolumeError, volume_error_mm
+from fpp_ml_bench.calibration.volume import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
-from fpp_ml_bench.cli.options import SPLITS, command, new_file
+from fpp_ml_bench.cli.options import SPLITS, command, names, new_file, value
 from fpp_ml_bench.constants import MM_PER_M, VIEWS
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.evaluation.result.file import write_json
@@ -17,7 +18,13 @@ from fpp_ml_bench.evaluation.score.check import predicted_mm
 from fpp_ml_bench.files import write_files
 from fpp_ml_bench.loaders.cloud import write_cloud
 from fpp_ml_bench.loaders.pictures import contact_sheet, front_picture, sample_cloud, sample_picture
-from fpp_ml_bench.loaders.published.exporting import FORMS, SAMPLE_FORMS, chosen_splits
+from fpp_ml_bench.loaders.published.exporting import (
+    FORMS,
+    MAP_FORMS,
+    SAMPLE_FORMS,
+    Maps,
+    chosen_splits,
+)
 from fpp_ml_bench.loaders.published.exporting import export as export_published
 from fpp_ml_bench.loaders.render.scene import PHOTOGRAPHED_BY
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
@@ -193,8 +200,8 @@ def show_sample(
             "expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the "
             "samples"
         )
-    for flag, value in (("--cloud", cloud), ("--predictions", predictions)):
-        if sheet and value:
+    for flag, given in (("--cloud", cloud), ("--predictions", predictions)):
+        if sheet and given:
             raise DatasetError(
                 f"{flag}: expected a SAMPLE, which it shows, not --sheet; leave one of them out"
             )
@@ -265,6 +272,8 @@ def verify(
 @command("""\
 fpp-bench export data/mini --out hub --parquet              plain load_dataset opens every configuration
 fpp-bench export data/mini --out tree --mat                 the published layout; fpp-bench import reads it back
+fpp-bench export data/mini --out maps --maps pfm,png        depth in mm, a file a sample, as other benchmarks
+fpp-bench export data/mini --out clouds --maps ply --predictions predictions --split test    of what a method made
 fpp-bench export data/mini --out out --meshes --patterns    several forms: out/meshes and out/patterns
 fpp-bench export data/mini --out test --parquet --split test
 """)
@@ -274,25 +283,54 @@ def export(
     out: Path = option(REQUIRED, "new or empty folder; written completely or not at all", "DIR"),
     parquet: bool = option(False, "Parquet and a card, ready for the Hugging Face Hub"),
     mat: bool = option(False, "the published tree: PNG fringes, .mat depth, raw scans"),
+    maps: tuple[str, ...] = option(
+        (),
+        "depth maps, a file a sample: pfm (float32 mm), png (16 bits, png_scale.txt says the unit), "
+        "ply (points in mm)",
+        "A,B",
+        parse=value(
+            f"some of {', '.join(MAP_FORMS)}",
+            names,
+            lambda some: some != () and set(some) <= {*MAP_FORMS},
+        ),
+    ),
+    predictions: Path | None = option(
+        None, "with --maps: those of this folder of predictions, of one split", "DIR"
+    ),
     meshes: bool = option(False, "the objects' meshes as PLY (metres)"),
     patterns: bool = option(False, "the projected patterns as PNG"),
     split: str = option("all", "samples to export (default: all)", choices=SPLITS),
 ) -> None:
-    """Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns.
+    """Write a dataset as Parquet, the published .mat tree, depth maps, meshes or patterns.
 
     Raises FppBenchError for an unusable dataset, form or folder."""
-    wanted = {"parquet": parquet, "mat": mat, "meshes": meshes, "patterns": patterns}
+    wanted = {
+        "parquet": parquet,
+        "mat": mat,
+        "maps": maps,
+        "meshes": meshes,
+        "patterns": patterns,
+    }
     forms = [form for form in FORMS if wanted[form]]
+    if predictions is not None and (not maps or split == "all"):
+        raise BuildError("--predictions: needs --maps, and --split with the split they are of")
     if not forms:
         raise BuildError(
-            "nothing to export: give at least one of --parquet, --mat, --meshes, --patterns"
+            "nothing to export: give at least one of --parquet, --mat, --maps, --meshes, --patterns"
         )
     opened = DatasetFolder(dataset)
     splits = chosen_splits(opened, split)
+    target = DEPTH_EXACT if opened.has_exact else DEPTH
+
+    def depth_mm(sample: str) -> NDArray[Any]:
+        if predictions is None:
+            return opened.depth_mm(sample)
+        return predicted_mm(predictions, opened, splits[0], sample, target)[1]
+
     samples = sum(len(opened.samples(part)) for part in splits)
     steps = samples * sum(form in SAMPLE_FORMS for form in forms)
     with progress_bar("exporting", steps, "samples") as advance:
-        export_published(opened, out, forms, splits, usable_cores(), advance)
+        export_published(opened, out, forms, splits, usable_cores(), advance, Maps(maps, depth_mm))
     files = [path for path in out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")

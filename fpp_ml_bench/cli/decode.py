@@ -137,7 +137,11 @@ def _print(result: "DecodedCapture") -> None:
         f"depth           {depths.min():.1f} to {depths.max():.1f} mm, median "
         f"{np.median(depths):.1f} mm"
     )
-    noise = f"noise of {result.noise_grey:.2f} grey levels, {source}"
     if result.examination.not_checked:
         print(f"not checked     {'; '.join(result.examination.not_checked)}")
-    print(f"uncertainty     {np.median(sigmas):.3f} mm (standard, median over pixels; by {noise})")
+    noise = f"noise of {result.noise_grey:.2f} grey levels a frame, {source}"
+    print(f"uncertainty     {np.median(sigmas):.3f} mm (standard, median over pixels; {noise})")
+    for name, sigma_mm in result.budget_mm.items():
+        print(f"  by {name + ':':<31} {sigma_mm:.3f} mm")
+    periods = ", ".join(f"{mm:.1f} mm {name}" for name, mm in result.period_mm.items())
+    print(f"  an order that is wrong by one would add {periods}; doubtful ones are refused")

@@ -21,7 +21,6 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 from fpp_ml_bench.baselines.diagnostics.probe import diagnose as run_diagnosis
 from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.baselines.robustness.axes import CACHE, CLEAN, SETS, Condition, severity_means
 from fpp_ml_bench.baselines.robustness.run import Setup, View, write_page
 from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
@@ -192,12 +191,33 @@ def reliance(
     moved = [value for key, value in measured.parts if not key.startswith("answered")]
     if any(moved):
         show(_reliance_table(method.title, measured))
+        print(_verdict(measured))
     else:
         print(
             f"{method.title}: gives the same answer whatever phase, light and outline of "
             f"{measured.samples} samples "
             "are, so it reads nothing of them. Phase reliance 0."
         )
+
+
+FOLLOWS, HARDLY = 0.75, 0.25
+"""Scores from which a method follows the phase, and below which it hardly does: quarters of the
+scale, for words alone."""
+
+
+def _verdict(reliance: Reliance) -> str:
+    """The score in a sentence."""
+    within = reliance.score if reliance.order_free_score is None else reliance.order_free_score
+    if reliance.score >= FOLLOWS:
+        return "The depth follows the fringe's phase, and its whole periods do, too."
+    if within >= FOLLOWS:
+        return (
+            "The depth follows the phase within a period; which period it is in comes from "
+            "something else: brightness, outline or a prior."
+        )
+    if within < HARDLY:
+        return "The depth hardly follows the phase: it comes from outline, light or a prior."
+    return "The depth follows the phase in part, and in part outline, light or a prior."
 
 
 def _reliance_table(title: str, reliance: Reliance) -> Table:
@@ -261,7 +281,7 @@ def robust(
     workers = pool.processes
     if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    rig = find(chosen.name).method.scenes_rig(chosen.options)
+    rig = chosen.method.scenes_rig(chosen.options)
     settings = Condition(CLEAN, 0, SETS[objects], size, rig).settings
     method = chosen.load(Scenes.of(settings), warn=False)
     entry = None if into is None else read_entry(into)

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fpp_ml_bench.baselines import registry
+from fpp_ml_bench.baselines.from_hub import FILE_MARK, SCHEME
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.training.weights import shipped_names, training_data_warning
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, Command, Row, flags_of, parameter_of, row_of
 from fpp_ml_bench.errors import FppBenchError, PredictionError
 from fpp_ml_bench.files import is_file
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import argument, flag_of, option, options_of
 
 if TYPE_CHECKING:
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
 _OF_METHODS = "options of methods"
 NO_OPTIONS = [("no options", "")]
+TRUST = "--trust"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,25 +35,31 @@ class MethodSettings:
     gives, by the names of its fields."""
 
     name: str = argument(
-        "one of those below with their options, the name of weights that come with the package, a "
-        ".safetensors file, a "
-        "recipe that fpp-bench reproduce has trained (loss/l1), or file.py:Class, a method of "
-        "yours; that file is "
-        "executed",
+        "one of those below, the name of weights that come with the package, a .safetensors file, "
+        "a recipe that fpp-bench reproduce has trained (loss/l1), hf://OWNER/NAME, a model of the "
+        "Hub, or file.py:Class, a method of yours; that file is executed",
         "METHOD",
     )
     threads: int = option(1, "threads a sample (default: 1)", "N", parse=AT_LEAST_ONE)
+    trust: bool = option(False, "run the code that a repository hf://OWNER/NAME brings")
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def load(self, dataset: "Photographed", warn: bool = True) -> Method:
-        """The method for the rig of ``dataset``. Unless told not to, warns on standard error about
+    @property
+    def method(self) -> type[Method]:
+        return registry.find(self.name, self.trust).method
+
+    def load(self, dataset: "Photographed | Rig", warn: bool = True) -> Method:
+        """The method for the rig of ``dataset``, or for a rig. Unless told not to, warns on standard error about
         weights that were trained on another version of the dataset's benchmark. Raises
         FppBenchError for an unknown method."""
-        known = [entry.name for entry in fields(registry.find(self.name).method.Options)]
+        known = [entry.name for entry in fields(self.method.Options)]
         threads = {"threads": self.threads} if "threads" in known else {}
-        method = registry.load_method(self.name, dataset, **self.options, **threads)
+        method = registry.load_method(
+            self.name, dataset, trust=self.trust, **self.options, **threads
+        )
         config = method.weights_config
-        warning = None if config is None else training_data_warning(config, dataset.manifest)
+        told = None if isinstance(dataset, Rig) else dataset.manifest
+        warning = None if config is None or told is None else training_data_warning(config, told)
         if warn and config is not None and warning is not None:
             print(f"warning: {config.name} was {warning}", file=sys.stderr)
         return method
@@ -66,10 +75,11 @@ class MethodCommand(Command):
     def methods(self, words: Sequence[str]) -> dict[str, type[Method]]:
         """The methods by what the command line calls them, the user's own first: where two share a
         flag, the first says whether a value stands behind it."""
+        trust = TRUST in words
         own = {
-            word: registry.find(word).method
+            word: registry.find(word, trust).method
             for word in words
-            if registry.FILE_MARK in word and word[0] != "-"
+            if (FILE_MARK in word and word[0] != "-") or word.startswith(SCHEME)
         }
         every = {**own, **registry.methods(), "": registry.network_method()}
         return {
@@ -114,7 +124,7 @@ class MethodCommand(Command):
             )
         given = {flag: text for flag in of_methods if (text := ctx.params[flag]) not in (None, ())}
         if of_others := [flag for flag in given if flag not in own]:
-            if name not in methods and registry.FILE_MARK not in name:
+            if name not in methods and FILE_MARK not in name:
                 registry.find(name)  # says what else was probably meant
             owners = [
                 label_of(other)
@@ -134,12 +144,20 @@ class MethodCommand(Command):
         return [*super().get_params(ctx), *ctx.meta.get(_OF_METHODS, ())]
 
     def sections(self, ctx: click.Context) -> dict[str, list[Row]]:
+        """The options of the method that the command line names; without one, what methods there
+        are."""
         sections = super().sections(ctx)
-        for method in self.methods(ctx.obj).values():
-            params = [parameter_of(entry) for entry in self.fields_of(method).values()]
-            sections[f"{label_of(method)} ({method.purpose})"] = [
-                row_of(p, ctx) for p in params
-            ] or NO_OPTIONS
+        methods = self.methods(ctx.obj)
+        named = next((word for word in ctx.obj if methods.get(word) is not None), None)
+        if named is None:
+            how = f"methods ({ctx.command_path} METHOD --help shows the options of one)"
+            sections[how] = [(label_of(method), method.purpose) for method in methods.values()]
+            return sections
+        method = methods[named]
+        params = [parameter_of(entry) for entry in self.fields_of(method).values()]
+        sections[f"{label_of(method)} ({method.purpose})"] = [
+            row_of(p, ctx) for p in params
+        ] or NO_OPTIONS
         return sections
 
     def invoke(self, ctx: click.Context) -> int:

@@ -11,6 +11,7 @@ from functools import partial
 from inspect import getdoc, signature
 from io import StringIO
 from pathlib import Path
+from shutil import get_terminal_size
 from tempfile import TemporaryDirectory
 from textwrap import indent
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.skipping import Explanation
 
 SPLITS = ("train", "validation", "test", "all")
-HELP_WIDTH, LEFT_COLUMN = 110, 28
+HELP_WIDTH, NARROWEST, LEFT_COLUMN = 110, 60, 28
 STANDARD_OUTPUT = "-"
 OPTIONS = "options"
 """Heading of the options of a settings class that has no ``HEADING`` of its own."""
@@ -351,7 +352,8 @@ def help_text(
 ) -> str:
     """The help of a program or command: how it is run (its name, and the words behind it), its
     purpose, terms and what they mean by heading, and examples."""
-    formatter = click.HelpFormatter(width=HELP_WIDTH)
+    shown = get_terminal_size((HELP_WIDTH, 0)).columns
+    formatter = click.HelpFormatter(width=max(min(shown, HELP_WIDTH), NARROWEST))
     for name, words in usages:
         formatter.write_usage(name, words, "usage: ")
     formatter.write_paragraph()

@@ -98,7 +98,7 @@ class PatternSettings(DesignSettings):
 
 @command(
     """\
-fpp-bench patterns rig.yaml --out patterns           patterns/A_0.png, A_1.png, ... and patterns.json
+fpp-bench patterns rig.yaml --out patterns           patterns/A_00.png, A_01.png, ... and patterns.json
 fpp-bench patterns paper --out patterns              the paper's 52 frames
 fpp-bench patterns crossed --out patterns            the same after three crossed frames
 

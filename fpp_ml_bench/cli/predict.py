@@ -8,7 +8,6 @@ from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.baselines.run import explain_predict, predict_split
 from fpp_ml_bench.baselines.timing import (
     check_same_method,
@@ -92,7 +91,7 @@ def _predict_all(
     """Predict each of ``datasets`` into a folder of its name, finished ones kept. Where the method
     can't be for the rig, the folder says so. Raises `SubmissionError` for predictions of another
     method there."""
-    find(chosen.name)  # an unknown method is refused by no rig
+    _ = chosen.method  # an unknown method is refused by no rig
     opened = {name: DatasetFolder(place) for name, place in datasets.items()}
     samples = sum(len(dataset.samples(split)) for dataset in opened.values())
     said = {}

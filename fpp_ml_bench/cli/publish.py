@@ -29,6 +29,10 @@ publish = Program(
                 "publish:publish_leaderboard",
                 "the leaderboard's page as a static Space",
             ),
+            "method": (
+                "publish:publish_method",
+                "trained weights, or a method of yours, for predict hf://OWNER/NAME",
+            ),
             "results": (
                 "publish:publish_results",
                 "results as .eval_results/*.yaml of a model's repository",
@@ -39,6 +43,7 @@ publish = Program(
 fpp-bench publish dataset data/mini --repo me/fpp-mini --dry-run      what would change; sends nothing
 fpp-bench publish dataset data/full --repo me/fpp --staging staged    continues where an earlier run stopped
 fpp-bench publish leaderboard --repo me/fpp-leaderboard --dataset-repo me/fpp
+fpp-bench publish method runs/mine/weights.safetensors --repo me/my-model
 fpp-bench publish results result.json --repo me/my-model --dataset-repo me/fpp
 """,
 )
@@ -100,7 +105,9 @@ def publish_dataset(
         try:
             with progress_bar("preparing", rows, "samples") as advance:
                 stage = hub_client.stage_dataset
-                publication = stage(opened, target.repo, folder, texts, usable_cores(), advance)
+                publication = stage(
+                    opened, target.repo, licence, folder, texts, usable_cores(), advance
+                )
         except OSError as error:
             raise PublishError(
                 f"can't put the files together in {folder} ({error.strerror or error}); free some "
@@ -133,6 +140,26 @@ def publish_leaderboard(
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
         publication = board_publish.stage_page(results, target.repo, Path(folder), dataset_repo)
         _carry_out(target, hub, publication, _remote(target, hub, "space"))
+
+
+@command(
+    """\
+fpp-bench publish method runs/mine/weights.safetensors --repo me/my-model
+fpp-bench publish method mine.py:Mine --repo me/my-method --dry-run
+"""
+)
+def publish_method(
+    *,
+    method: str = argument(
+        "weights (a name, recipe or .safetensors file), or file.py:Class", "METHOD"
+    ),
+    target: FilledRepository,
+) -> None:
+    """Publish a method as a model repository: fpp-bench predict hf://OWNER/NAME runs it."""
+    hub = hub_client.Hub()
+    with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
+        publication = board_publish.stage_method(method, target.repo, Path(folder))
+        _carry_out(target, hub, publication, _remote(target, hub, "model", new=True))
 
 
 @command(
@@ -179,12 +206,14 @@ def _state(
         return hub_client.Remote(None, asked=False)
 
 
-def _remote(target: Repository, hub: hub_client.Hub, kind: hub_client.Kind) -> hub_client.Remote:
+def _remote(
+    target: Repository, hub: hub_client.Hub, kind: hub_client.Kind, new: bool = False
+) -> hub_client.Remote:
     """The current state of the repository, after checking that token, owner and visibility allow
-    the run."""
+    the run; a model that is not there is made only where ``new`` says so."""
     names = set() if target.dry_run else hub.check_token()
     remote = _state(target, hub, kind, target.repo)
-    if not remote.exists and kind == "model" and remote.asked:
+    if not remote.exists and kind == "model" and remote.asked and not new:
         raise PublishError(
             f"{target.repo}: no such model on {hub.endpoint}, or this token may not see it; make "
             f"it first"

@@ -11,7 +11,7 @@ which for the paper's rig is ``Z = f_p b / (u_p - c_u - f_p x)``. Depth is the c
 length of the ray.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -46,6 +46,8 @@ fewer the direction is left out."""
 _BRIGHTNESSES = 12
 """Groups of as many pixels each, by brightness, in which noise is estimated: noise grows with
 light, and the line through them needs several."""
+ROUNDING_GREY = 12**-0.5
+"""Standard deviation of rounding to whole grey levels: that of an even distribution of width 1."""
 _LEAST_VARIANCE = 1 / 12
 """Least variance of noise in squared grey levels: that of rounding to whole grey levels."""
 _HIGHEST_HARMONIC = 4
@@ -241,6 +243,63 @@ def depth_sigma_mm(
     ``systematic_rad`` of every phase, one for all or by direction: gamma, blur, further bounces,
     and of `Rig.calibration_px`. Raises `DecodeError` for a decoding without details, or noise that
     is none."""
+    valid = decoded.depth_mm > 0
+    precision = sum(
+        share.precision for share in _shares(decoded, rig, noise_grey, steps, systematic_rad)
+    )
+    sigma_mm = np.zeros(decoded.depth_mm.shape, dtype=np.float32)
+    with np.errstate(divide="ignore"):
+        sigma_mm[valid] = np.where(precision > 0, 1 / np.sqrt(precision), np.finfo(np.float32).max)
+    return sigma_mm
+
+
+def depth_budget_mm(
+    decoded: "Decoded",
+    rig: Rig,
+    noise_grey: NDArray | float,
+    systematic_rad: Mapping[str, float],
+    rounding_grey: float = ROUNDING_GREY,
+) -> dict[str, NDArray[np.float64]]:
+    """What `depth_sigma_mm` consists of: the standard uncertainty in mm of each source alone, (n,)
+    of the n decoded pixels in the order of the image, whose squares add up to its square; infinite
+    where nothing tells the depth. ``rounding_grey``: the part of the noise that is the frames'
+    rounding to levels. Arguments and errors as there."""
+    shares = list(_shares(decoded, rig, noise_grey, None, systematic_rad))
+    rounded = np.minimum(rounding_grey / shares[0].noise_grey, 1.0) ** 2
+    precision = sum(share.precision for share in shares)
+    with np.errstate(divide="ignore", invalid="ignore"):
+
+        def together(variance: Callable[[_Share], NDArray[np.float64] | float]) -> NDArray:
+            parts = (share.precision * variance(share) / share.total_px2 for share in shares)
+            return np.where(precision > 0, np.sqrt(sum(parts)) / precision, np.inf)
+
+        return {
+            "noise": together(lambda share: share.noise_px2 * (1 - rounded)),
+            "rounding to grey levels": together(lambda share: share.noise_px2 * rounded),
+            "response and epipolar pattern": together(lambda share: share.systematic_px2),
+            "calibration": together(lambda share: rig.calibration_px**2),
+        }
+
+
+class _Share(NamedTuple):
+    """Of a direction's coordinate: variances in px2, (n,) or one number, and the precision of the
+    depth by it alone in 1/mm2 (n,)."""
+
+    noise_grey: NDArray[np.float64]
+    noise_px2: NDArray[np.float64]
+    systematic_px2: float
+    total_px2: NDArray[np.float64]
+    precision: NDArray[np.float64]
+
+
+def _shares(
+    decoded: "Decoded",
+    rig: Rig,
+    noise_grey: NDArray | float,
+    steps: int | None,
+    systematic_rad: float | Mapping[str, float],
+) -> Iterator[_Share]:
+    """Of every decoded direction; see `depth_sigma_mm`."""
     if not decoded.details:
         raise DecodeError("details: missing; decode with details=True")
     noise = np.asarray(noise_grey, dtype=np.float64)
@@ -249,7 +308,6 @@ def depth_sigma_mm(
     valid = decoded.depth_mm > 0
     rays = tuple(axis[valid] for axis in rig.camera.rays())
     valid_noise = noise[valid] if noise.ndim else noise
-    precision = np.zeros(int(valid.sum()))
     for direction, measured in decoded.details.items():
         code, modulation = rig.code(direction), measured.modulation[valid]
         fewer, systematic_px = 1.0, 0.0
@@ -262,15 +320,12 @@ def depth_sigma_mm(
             )
             systematic_px = code.pitch_px * rad / (2 * np.pi)
         noise_px = code.sigma_px(modulation, valid_noise / np.sqrt(fewer))
-        sigma_px = np.sqrt(noise_px**2 + systematic_px**2 + rig.calibration_px**2)
+        total_px2 = noise_px**2 + systematic_px**2 + rig.calibration_px**2
         slope = coordinate_slope_px_per_mm(
             rig, decoded.depth_mm[valid], direction, (rays[0], rays[1])
         )
-        precision += (slope / sigma_px) ** 2
-    sigma_mm = np.zeros(decoded.depth_mm.shape, dtype=np.float32)
-    with np.errstate(divide="ignore"):
-        sigma_mm[valid] = np.where(precision > 0, 1 / np.sqrt(precision), np.finfo(np.float32).max)
-    return sigma_mm
+        precision = (slope / np.sqrt(total_px2)) ** 2
+        yield _Share(valid_noise, noise_px**2, systematic_px**2, total_px2, precision)
 
 
 def noise_of_frames(frames: Sequence[NDArray | None], rig: Rig) -> float | None:

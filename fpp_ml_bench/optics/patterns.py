@@ -83,9 +83,12 @@ def pattern_image(rig: Rig, index: int) -> NDArray[np.uint8]:
 
 
 def pattern_files(rig: Rig) -> dict[str, bytes]:
-    """Every pattern as PNG (8-bit grey, lossless) by file name, ``A_{i}.png``, in frame order."""
+    """Every pattern as PNG (8-bit grey, lossless) by file name, ``A_00.png``, in frame order, which
+    is that of the names."""
+    digits = len(str(len(rig.sequence) - 1))
     return {
-        f"A_{index}.png": png_bytes(pattern_image(rig, index)) for index in range(len(rig.sequence))
+        f"A_{index:0{digits}}.png": png_bytes(pattern_image(rig, index))
+        for index in range(len(rig.sequence))
     }
 
 

@@ -137,7 +137,9 @@ def load_rig(path: str | Path) -> Rig:
             key for key in ("camera", "projector", "rotation", "translation_m") if key in entries
         ]
         require(
-            not twice, f"calibration: {', '.join(twice)} given besides; a rig has one calibration"
+            not twice,
+            f"calibration: {', '.join(twice)} given besides; a rig has one "
+            "calibration: remove one of them",
         )
         given = named if isinstance(named, Mapping) else {"file": named}
         given = mapping(given, ("file",), "calibration", ("unit", "camera_size", "projector_size"))

@@ -26,10 +26,18 @@ from fpp_ml_bench.calibration.projector_points import (
 )
 from fpp_ml_bench.calibration.result import Calibration
 from fpp_ml_bench.calibration.solve import raise_all
+from fpp_ml_bench.calibration.volume import Places, depth_spread
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding.decode import Decoded, Directions, check_limits, decode_stack
-from fpp_ml_bench.decoding.triangulation import ASSUMED_NOISE_GREY, depth_sigma_mm, noise_of_frames
+from fpp_ml_bench.decoding.triangulation import (
+    ASSUMED_NOISE_GREY,
+    ROUNDING_GREY,
+    coordinate_slope_px_per_mm,
+    depth_budget_mm,
+    depth_sigma_mm,
+    noise_of_frames,
+)
 from fpp_ml_bench.errors import CalibrationError, CaptureError, DecodeError
 from fpp_ml_bench.examination.examine import examine
 from fpp_ml_bench.examination.findings import Examination, Finding, RefusedCapture
@@ -81,7 +89,9 @@ distance."""
 class DecodedCapture:
     """A decoded capture: maps (H, W) of standard uncertainty by noise in mm (0 = no depth),
     modulation and mean of the frames in grey levels; the noise of a frame, and whether it was
-    estimated from the frames; ``notes`` are sentences; ``examination``: what the frames say about
+    estimated from the frames; medians over the pixels of what each source adds to the uncertainty,
+    ``budget_mm`` (`depth_budget_mm`), and of the depth that a period is of each direction,
+    ``period_mm``; ``notes`` are sentences; ``examination``: what the frames say about
     themselves."""
 
     decoded: Decoded
@@ -90,6 +100,8 @@ class DecodedCapture:
     grey: NDArray[np.float32]
     noise_grey: float
     noise_measured: bool
+    budget_mm: Mapping[str, float]
+    period_mm: Mapping[str, float]
     notes: tuple[str, ...]
     examination: Examination
 
@@ -128,7 +140,10 @@ def decode_capture(
         raise DecodeError(
             f"no pixel could be decoded; of most pixels: {reason.words}; probably {CAUSES[reason]}"
         )
-    sigma_mm = depth_sigma_mm(decoded, rig, noise, systematic_rad=examination.systematic_rad)
+    systematic_rad = examination.systematic_rad
+    sigma_mm = depth_sigma_mm(decoded, rig, noise, systematic_rad=systematic_rad)
+    rounding_grey = ROUNDING_GREY * GREY_LEVELS / capture.full_scale
+    budget_mm = depth_budget_mm(decoded, rig, noise, systematic_rad, rounding_grey)
     grey = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     return DecodedCapture(
         decoded,
@@ -137,9 +152,28 @@ def decode_capture(
         grey,
         noise,
         measured_grey is not None,
+        {source: float(np.median(part)) for source, part in budget_mm.items()},
+        _period_mm(decoded, rig),
         tuple(notes),
         examination,
     )
+
+
+def _period_mm(decoded: Decoded, rig: Rig) -> dict[str, float]:
+    """How far a wrong order moves the depth, by direction: the median over decoded pixels."""
+    valid = decoded.depth_mm > 0
+    x, y = (axis[valid] for axis in rig.camera.rays())
+    return {
+        direction: float(
+            np.median(
+                rig.code(direction).pitch_px
+                / np.abs(
+                    coordinate_slope_px_per_mm(rig, decoded.depth_mm[valid], direction, (x, y))
+                )
+            )
+        )
+        for direction in decoded.details
+    }
 
 
 def _examined_and_decoded(
@@ -491,8 +525,8 @@ def calibrated_rig(
     calibration: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None
 ) -> Rig:
     """The rig of a calibration, with the sequence of ``stand_in``; its working range is
-    ``range_mm``, or that of the boards' points and a margin. Its error is that of the poses which
-    did not take part, or of those which did."""
+    ``range_mm``, or that of the boards' points and a margin. Its error is what the calibration's
+    covariance leaves at half of the points of its volume."""
     depths = [
         calibration.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2]
         for pose in calibration.poses
@@ -501,13 +535,11 @@ def calibrated_rig(
         float(np.min(depths)) * (1 - RANGE_MARGIN),
         float(np.max(depths)) * (1 + RANGE_MARGIN),
     )
-    return replace(
+    rig = replace(
         stand_in,
         camera=calibration.camera.pinhole,
         projector=calibration.projector.pinhole,
         rotation=calibration.rotation,
         translation_m=calibration.translation_m,
-        calibration_px=calibration.held_out_rms_px
-        if np.isfinite(calibration.held_out_rms_px)
-        else calibration.rms_px.both,
     ).with_range((near, far))
+    return replace(rig, calibration_px=depth_spread(Places.over(rig), calibration.root).median_px)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.coding.code import Reason
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.containers import matrix_bytes
+from fpp_ml_bench.containers import matrix_bytes, pfm_bytes
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.examination.findings import Examination
 from fpp_ml_bench.files import LOCK_FILE, UNFINISHED, write_files
@@ -28,11 +28,11 @@ from fpp_ml_bench.loaders.pictures import capture_picture
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 
-FORMS = ("npy", "mat", "png", "ply", "mesh")
+FORMS = ("npy", "mat", "png", "pfm", "ply", "mesh")
 REPORT = "decode.json"
 CAMERA_AXES = "unit mm (millimetres); camera axes: x right, y down, z forward"
 _WRITTEN = re.compile(
-    r"decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.mat|depth_[0-9.]+mm\.png|(points|mesh)\.ply"
+    r"decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.(mat|pfm)|depth_[0-9.]+mm\.png|(points|mesh)\.ply"
     rf"|picture\.png|{UNFINISHED}"
 )
 """Names that a decoding writes, and those of the files that a killed one did not finish."""
@@ -69,6 +69,7 @@ def export_capture(
         mat    depth.mat: float32 mm, variable depthMap
         png    depth_0.1mm.png: 16-bit levels of a unit from 0.001 to 10 mm, the finest that fits; the unit is in the
                name and in the text chunk mm_per_level
+        pfm    depth.pfm: portable float map, float32 mm
         ply    points.ply: binary, a point per pixel with depth: position in mm, normal, and ``grey`` (H, W), grey
                levels of 0 to 255, as intensity and colour
         mesh   mesh.ply: the same points, neighbours joined by triangles
@@ -91,7 +92,8 @@ def export_capture(
     written = {
         "npy": lambda: ("depth.npy", _npy(depth)),
         "mat": lambda: ("depth.mat", matrix_bytes({"depthMap": depth})),
-        "png": lambda: _png(depth),
+        "png": lambda: _named_png(depth),
+        "pfm": lambda: ("depth.pfm", pfm_bytes(depth)),
         "ply": lambda: ("points.ply", depth_ply(depth, camera, shade)),
         "mesh": lambda: ("mesh.ply", depth_ply(depth, camera, shade, joined=True)),
     }
@@ -200,12 +202,9 @@ def _joined(
     return (near > 0) & (far > 0) & (np.abs(near - far) <= steepest * apart)
 
 
-def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
-    """Name and content, in the finest unit that fits."""
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
-    largest_mm = float(depth.max())
+def finest_unit_mm(largest_mm: float) -> float:
+    """The first of `MM_PER_LEVEL` in which a depth fits into 16 bits; `CaptureError` where none
+    is."""
     fitting = [unit for unit in MM_PER_LEVEL if largest_mm <= LARGEST_LEVEL * unit]
     if not fitting:
         limit = LARGEST_LEVEL * MM_PER_LEVEL[-1]
@@ -213,13 +212,25 @@ def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
             f"depth_mm: {largest_mm:g} mm do not fit in a 16-bit PNG, whose limit is {limit:g} mm; "
             f"use npy"
         )
-    unit = fitting[0]
-    levels = np.rint(depth.astype(np.float64) / unit)
+    return fitting[0]
+
+
+def depth_png(depth: NDArray[np.float32], unit_mm: float) -> bytes:
+    """A depth map in mm, 0 = none, as 16-bit PNG of levels of ``unit_mm``, which it also says."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    levels = np.rint(depth.astype(np.float64) / unit_mm)
     levels = np.where(depth > 0, np.clip(levels, 1, LARGEST_LEVEL), 0).astype(np.uint16)
     text, buffer = PngInfo(), io.BytesIO()
-    text.add_text("mm_per_level", f"{unit:g}")
+    text.add_text("mm_per_level", f"{unit_mm:g}")
     Image.fromarray(levels).save(buffer, format="PNG", pnginfo=text)
-    return f"depth_{unit:g}mm.png", buffer.getvalue()
+    return buffer.getvalue()
+
+
+def _named_png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
+    unit_mm = finest_unit_mm(float(depth.max()))
+    return f"depth_{unit_mm:g}mm.png", depth_png(depth, unit_mm)
 
 
 def camera_points(
@@ -333,6 +344,7 @@ def write_capture(
         noise_grey=result.noise_grey,
         noise_measured=result.noise_measured,
         median_sigma_mm=float(np.median(sigma_mm[valid])),
+        median_sigma_mm_by_source=dict(result.budget_mm),
         notes=list(result.notes),
         reasons={reason.name.lower(): int(reason) for reason in Reason},
     )

@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.calibration.result import volume_error_mm
+from fpp_ml_bench.calibration.volume import volume_error_mm
 from fpp_ml_bench.constants import SPLITS, sample_name, split_of
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply

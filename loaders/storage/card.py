@@ -22,6 +22,8 @@ from fpp_ml_bench.optics.rig_file import rig_from_dict, save_rig
 
 RIG_FILE = "rig.yaml"
 NAME = "FPP-ML-Bench"
+DOI = "10.1117/12.3082257"
+"""Of the paper whose benchmark it builds on."""
 _FOLDER_TEXT = """\
 Frames stored: `{stored}`.
 
@@ -81,7 +83,7 @@ _END = """\
   pages     = {{1390402}},
   publisher = {{SPIE}},
   year      = {{2026}},
-  doi       = {{10.1117/12.3082257}}
+  doi       = {{{doi}}}
 }}
 @misc{{haroon_shortcuts,
   author = {{Adam Haroon and Anush Lakshman and Cody Fleming and Beiwen Li}},
@@ -96,6 +98,11 @@ def yaml_text(content: Any, allow_unicode: bool = False) -> str:
     return str(yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=allow_unicode))
 
 
+def default_licence(manifest: Manifest) -> str:
+    """MIT, for captures unknown, as they are under none until their owner says so."""
+    return "unknown" if manifest.origin == CAPTURED else "mit"
+
+
 def front_matter(
     manifest: Manifest,
     configs: list[Any],
@@ -104,11 +111,10 @@ def front_matter(
     **more: Any,
 ) -> str:
     """Front matter of a card: from it Hugging Face tools know configurations and files. ``licence``
-    is by default MIT, for captures unknown, as they are under none until their owner says so;
-    ``more`` are other keys."""
+    is by default `default_licence`; ``more`` are other keys."""
     rows = sum(map(len, manifest.samples.values()))
     head = {
-        "license": licence or ("unknown" if manifest.origin == CAPTURED else "mit"),
+        "license": licence or default_licence(manifest),
         "pretty_name": NAME,
         "task_categories": ["depth-estimation"],
         "size_categories": [
@@ -158,6 +164,11 @@ def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> 
             f"| `{name}`{f' ... `{frames[-1]}`' if many else ''} | {dtype}{shape} | {unit} | "
             f"{meaning} |"
         )
+    return _END.format(columns="\n".join(rows), limits=limitations(manifest), doi=DOI)
+
+
+def limitations(manifest: Manifest) -> str:
+    """What the dataset can't tell, as a list in Markdown."""
     settings, (near, far) = manifest.settings, rig_from_dict(manifest.rig).working_range_mm
     source = ""
     if "repository" in settings:
@@ -178,7 +189,7 @@ def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> 
     )
     if real:
         limits += "".join(f"- {line}.\n" for line in real["known"])
-    return _END.format(columns="\n".join(rows), limits=limits)
+    return limits
 
 
 def write_card(folder: Path, manifest: Manifest) -> list[str]:

@@ -37,7 +37,9 @@ from fpp_ml_bench.loaders.sample import (
     RANGE,
     config_columns,
 )
-from fpp_ml_bench.loaders.storage.card import card, card_config
+from fpp_ml_bench.loaders.storage.card import card, card_config, default_licence
+from fpp_ml_bench.loaders.storage.croissant import FILE as CROISSANT_FILE
+from fpp_ml_bench.loaders.storage.croissant import croissant
 from fpp_ml_bench.loaders.storage.manifest import ShardFile, damage_of
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -127,6 +129,12 @@ def write_parquet(
         fingerprint=dataset.fingerprint, config=dataset.configs[0], split=splits[0], names=names
     )
     rows = sum(len(dataset.samples(split)) for split in splits)
+    described = layout.features(
+        [name for name in columns(dataset) if name != PREVIEW], dataset.size
+    )
+    licence = default_licence(dataset.manifest)
+    metadata = croissant(dataset.manifest, described, splits, licence)
+    write_atomically(folder / CROISSANT_FILE, metadata)
     write_atomically(folder / "README.md", card(dataset.manifest, configs, ", Parquet", rows, text))
 
 
@@ -193,6 +201,8 @@ def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, 
     depths = [name + _LEAF for name in names if name in DEPTHS]
     values = [name for name in names if name in (*LABELS, *RANGE)]
     packed = {
+        "use_content_defined_chunking": True,  # a changed row changes few bytes on the Hub
+        "write_page_index": True,
         "compression_level": _LEVEL,
         "column_encoding": dict.fromkeys(depths, "BYTE_STREAM_SPLIT"),
     }
@@ -213,7 +223,6 @@ def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, 
         "compression": {**dict.fromkeys(compressed, "zstd"), **dict.fromkeys(whole, "none")},
         "use_dictionary": list(LABELS),
         "write_statistics": plain,
-        "write_page_index": True,
     }
 
 

@@ -94,6 +94,7 @@ def test_a_method_of_a_file_with_its_options(mine):
             "broken.py:Mine",
             r"broken.py: importing it failed: ZeroDivisionError: division by zero \(line 1\)",
         ),
+        ("untitled.py:Mine", "has no title, which a method needs"),
         ("spaces.py:Mine", "its name is 'a b'; expected text without spaces"),
     ],
 )
@@ -102,6 +103,7 @@ def test_files_that_hold_no_method(mine, name, says):
     (folder / "broken.py").write_text("1 / 0\n")
     (folder / "unheard.py").write_text(UNHEARD)
     (folder / "fixed.py").write_text(MINE + FIXED)
+    (folder / "untitled.py").write_text(MINE.replace("name, title, ", "name, other, "))
     (folder / "spaces.py").write_text(MINE.replace('"mine"', '"a b"'))
     with pytest.raises(PredictionError, match=says):
         load_method(str(folder / name), RIG)

@@ -76,8 +76,11 @@ def test_a_second_run_photographs_nothing_and_says_how_far_it_is_from_the_truth(
         and "warning:" not in printed.err
         and "note:" not in printed.err
     )
+    assert "standard uncertainty of the depth by this calibration" in printed.out
     first, again = (load_rig(virtual / f"{name}.yaml") for name in ("found", "again"))
     assert again.baseline_m == pytest.approx(first.baseline_m, rel=1e-9)
+    stated = f"as an error of the projector's coordinate: {again.calibration_px:.3f} px"
+    assert 0.01 < again.calibration_px < 1 and stated in printed.out
 
 
 def test_from_captures_a_wrong_spacing_scales_the_rig(virtual, tmp_path):

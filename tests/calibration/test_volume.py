@@ -6,9 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fpp_ml_bench.calibration.projector_points import measure_pose
-from fpp_ml_bench.calibration.result import Lens, volume_error_mm
+from fpp_ml_bench.calibration.projector_points import Pose, ProjectorPoints, measure_pose
+from fpp_ml_bench.calibration.result import Lens
 from fpp_ml_bench.calibration.solve import calibrate
+from fpp_ml_bench.calibration.volume import (
+    LENS_VALUES,
+    Places,
+    depth_spread,
+    volume_error_mm,
+)
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.loaders.captures.images import read_frames
@@ -97,3 +103,57 @@ def test_a_photographed_board_gives_the_rig_back_and_a_wrong_spacing_shows(captu
         assert error.rms_mm < 3  # at 300 px; 0.3 mm at 960 px with 18 poses and steps
     else:
         assert error.rms_mm == pytest.approx(90, abs=4)
+
+
+def test_an_unsure_baseline_leaves_a_share_of_every_depth():
+    """Depth is proportional to the baseline, and nothing else is unsure."""
+    parameters = 2 * (LENS_VALUES + len(RIG.camera.distortion)) + 6
+    root = np.zeros((parameters, 2))
+    root[-3:, 0] = 0.0006 * 1000 * RIG.t
+    root[-3:, 1] = 0.0008 * 1000 * RIG.t
+    places = Places.over(RIG)
+    spread = depth_spread(places, root)
+    expected = np.where(places.shown, 0.001 * places.depth_mm, np.nan)
+    np.testing.assert_allclose(spread.mm, expected, rtol=1e-6)
+    assert list(spread.maps(places)) == pytest.approx([1500, 1800, 2100])
+
+
+@pytest.mark.long
+def test_a_calibration_says_how_wrong_the_depth_by_it_is():
+    """Twelve calibrations, each from other errors of the board's points: what their depths are off
+    by has the size that their covariances state."""
+    rig = paper_rig(300)
+    board = replace(fitting_board(rig), detail_mm=0.0)
+    exact = []
+    for pose in board_poses(rig, board, 8):
+        points = pose.points_m(board.points_mm() / 1000)
+        image = rig.camera.fx * points[:, :2] / points[:, 2:]
+        exact.append((image + np.array(rig.camera.centre), np.stack(rig.project(points), 1)))
+    sizes = ((device.width, device.height) for device in (rig.camera, rig.projector))
+    size, of_projector = sizes
+    relative, random = [], np.random.default_rng(3)
+    for _ in range(12):
+        poses = []
+        for name, (image, shown) in enumerate(exact):
+            known = ProjectorPoints(
+                shown + random.normal(0, 0.1, shown.shape),
+                np.zeros_like(shown),
+                np.zeros((len(shown), 2, 2)),
+                {},
+            )
+            seen = image + random.normal(0, 0.04, image.shape)
+            poses.append(Pose(f"{name}", size, seen, known))
+        lenses = Lens("none"), Lens("none")
+        found = calibrate(poses, board, size, of_projector, lenses, hold_out=False)
+        own = replace(
+            rig,
+            camera=found.camera.pinhole,
+            projector=found.projector.pinhole,
+            rotation=found.rotation,
+            translation_m=found.translation_m,
+        )
+        error = Places.over(rig).found_mm(own) - Places.over(rig).depth_mm
+        relative.append(error / depth_spread(Places.over(own), found.root).mm)
+    # Points share a calibration's error, so that there are about twelve independent values.
+    assert 0.6 < np.sqrt(np.nanmean(np.square(relative))) < 1.4
+    assert np.nanmean(np.abs(relative) < 2) > 0.88

@@ -11,12 +11,21 @@ import trimesh
 from fpp_ml_bench.baselines.certify import gauges as module
 from fpp_ml_bench.baselines.certify.certificate import certify, scenes_of, write_certificate
 from fpp_ml_bench.baselines.certify.gauges import Gauge, TracedGauge, Volume, gauges
-from fpp_ml_bench.baselines.certify.quantities import QUANTITIES, fit_plane, fit_sphere, measure
+from fpp_ml_bench.baselines.certify.quantities import (
+    QUANTITIES,
+    corners_mm,
+    fit_plane,
+    fit_sphere,
+    lengths_off_mm,
+    measure,
+)
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import BuildError, PredictionError
+from fpp_ml_bench.loaders.render.boards.captures import photograph_board
+from fpp_ml_bench.loaders.render.boards.poses import board_poses, fitting_board
 from fpp_ml_bench.loaders.render.raycast import PixelRays
 from fpp_ml_bench.optics.named_rigs import paper_rig
 
@@ -138,6 +147,48 @@ def test_a_point_without_an_answer_is_refused_and_nothing_is_fitted_to_too_few()
     assert none.refused == 1 and set(none.values.values()) == {None}
 
 
+def test_corners_of_a_plane_and_their_distances_are_found():
+    """A tilted plane: 1 / z is linear in the image, so that corners between pixels are exact."""
+    x, y = RAYS
+    z = 1.8e3 / (1 + 0.3 * x - 0.2 * y)
+    points = np.stack([x * z, y * z, z], axis=-1)
+    points[::7, ::5] = np.nan
+    corners_px = np.array([[100.3, 120.7], [300.9, 130.2], [250.0, 400.4], [np.nan, 3.0]])
+    found = corners_mm(corners_px, points, 8.0)
+    u, v = RIG.camera.normalised(*corners_px[:3].T)
+    true = 1.8e3 / (1 + 0.3 * u - 0.2 * v)
+    np.testing.assert_allclose(found[:3], np.stack([u * true, v * true, true], axis=1), rtol=1e-9)
+    assert np.isnan(found[3]).all()
+    off = lengths_off_mm(found[:3] * 1.001, found[:3])
+    assert off == pytest.approx(0.001 * np.linalg.norm(found[[1, 2, 2]] - found[[0, 0, 1]], axis=1))
+
+
+@pytest.fixture(scope="module")
+def boards(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("boards") / "poses"
+    rig = paper_rig(360)
+    board = fitting_board(rig)
+    photograph_board(folder, rig, board, board_poses(rig, board)[:3])
+    return folder, board
+
+
+def test_a_real_board_is_a_gauge(boards, tmp_path, capsys):
+    folder, board = boards
+    words = ["certify", "classical", "--rig", str(folder / "rig.yaml"), "--out", str(tmp_path)]
+    assert main([*words, "--captures", str(folder), "--board", str(board)]) == 0
+    shown = json.loads((tmp_path / "certificate.json").read_text())
+    lines = {line["symbol"]: line for line in shown["lines"]}
+    assert set(lines) == {"F", "F95", "L"} and not shown["simulated"]
+    assert abs(lines["L"]["largest"]) < 2 and lines["F95"]["largest"] < 6
+    assert lines["F"]["positions"] == 3 and lines["F"]["expanded"] is None
+    assert "Test on a board" in (tmp_path / "certificate.html").read_text()
+    assert main([*words, "--captures", str(folder)]) == 2
+    assert "--captures and --board: expected both or none" in capsys.readouterr().err
+    without_rig = ["certify", "classical", "--out", str(tmp_path), "--board", str(board)]
+    assert main([*without_rig, "--captures", str(folder)]) == 2
+    assert "needs --rig" in capsys.readouterr().err
+
+
 class Far(Method):
     """Answers with a plane."""
 
@@ -152,7 +203,7 @@ def test_a_certificate_judges_by_its_limits_and_says_what_it_is(few, tmp_path):
     limits = {"PS": 5.0, "PF": 1e-6, "SD": 5.0}
     test = certify(load_method("classical", RIG, steps=3), settings, "paper", 3, limits)
     lines = {line.symbol: line for line in test.lines}
-    assert list(lines) == list(QUANTITIES)
+    assert list(lines) == [symbol for symbol in QUANTITIES if symbol != "L"]
     assert [lines[symbol].verdict for symbol in ("PS", "PF", "SD", "F")] == [
         "within",
         "beyond",
@@ -162,7 +213,7 @@ def test_a_certificate_judges_by_its_limits_and_says_what_it_is(few, tmp_path):
     assert abs(lines["PS"].largest) < 0.3 and 0 < lines["PF"].expanded < lines["PF"].largest
     page, data = write_certificate(test, tmp_path)
     text = page.read_text()
-    assert "nothing here is traceable" in text and "nothing conforms to a guideline" in text
+    assert "Nothing here is traceable" in text and "nothing conforms to a guideline" in text
     assert "conforms to VDI" not in text
     assert json.loads(data.read_text())["lines"][0]["symbol"] == "PF"
 
@@ -179,9 +230,18 @@ def test_what_cannot_be_tested_is_named(few, tmp_path, capsys):
     far.units = "normalised"
     with pytest.raises(PredictionError, match="gauges are measured in mm"):
         certify(far, scenes_of(RIG, "paper"), "paper")
+    far.units, far.uses_ground_truth_mask = "mm", True
+    with pytest.raises(PredictionError, match="is given the object's mask"):
+        certify(far, scenes_of(RIG, "paper"), "paper")
+    constant = certify(
+        load_method("constant", RIG, at="standoff"), scenes_of(RIG, "paper"), "paper", 1
+    )
+    assert constant.lines[0].largest > 10
     words = ["certify", "classical", "--out", str(tmp_path / "out")]
     assert main([*words, "--limits", "PS:1"]) == 2
     assert "--limits" in capsys.readouterr().err
+    assert main([*words, "--limits", "PS=nan"]) == 2
+    assert "numbers above 0" in capsys.readouterr().err
     assert main([*words, "--limits", "PQ=1"]) == 2
     assert "limit of PQ: expected one of PF, PF95" in capsys.readouterr().err
     assert main([*words, "--rig", str(tmp_path / "none.yaml")]) == 2

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from scored_dataset import make_dataset, write_description, write_predictions
 
+from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.cli import main, run_command
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.cli.options import WORKING_RANGE, command, command_line, given, names, value
@@ -186,10 +187,14 @@ def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny, ca
     assert settings == {"lit": 200, "steps": False, "source_sha256": settings["source_sha256"]}
     assert main(["predict", "mine.py:Mine", "--help"]) == 0
     out = capsys.readouterr().out
-    assert (
-        "mine (everything lit):\n  --lit GREY  grey level above which a pixel is lit" in out
-        and "classical (" in out
-    )
+    assert "mine (everything lit):\n  --lit GREY  grey level above which a pixel is lit" in out
+    assert "--depth-noise" not in out  # of another method
+    assert main(["predict", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "predict METHOD --help shows the options of one" in out and "--depth-noise" not in out
+    assert all(f"\n  {name} " in out for name in registry.methods())
+    assert main(["predict", "classical", "--help"]) == 0
+    assert "--depth-noise MM" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

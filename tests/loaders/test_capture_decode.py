@@ -3,6 +3,7 @@ codes alone."""
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from fpp_ml_bench.coding.code import Reason
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import (
     coordinate_slope_px_per_mm,
+    depth_budget_mm,
     depth_sigma_mm,
     noise_of_frames,
 )
@@ -104,6 +106,18 @@ def test_the_stated_uncertainty_is_that_of_noise():
     good = np.isfinite(depths).all(axis=0) & (sigma_mm > 0)
     seen = np.where(good, np.std(np.nan_to_num(depths), axis=0, ddof=1), np.nan)
     assert np.sqrt(np.mean(seen[good] ** 2 / sigma_mm[good] ** 2)) == pytest.approx(1, rel=0.05)
+    known = replace(rig, calibration_px=0.1)
+    budget = depth_budget_mm(decoded, known, noise, {"vertical": 0.01})
+    total_mm = np.sqrt(sum(part**2 for part in budget.values()))
+    valid = decoded.depth_mm > 0
+    again_mm = depth_sigma_mm(decoded, known, noise, systematic_rad={"vertical": 0.01})[valid]
+    np.testing.assert_allclose(total_mm, again_mm, rtol=1e-6)
+    np.testing.assert_allclose(
+        budget["rounding to grey levels"], sigma_mm[valid] / noise / 12**0.5, rtol=1e-6
+    )
+    pitch = known.code("vertical").pitch_px
+    ratio = budget["response and epipolar pattern"] / budget["calibration"]
+    np.testing.assert_allclose(ratio, 0.01 * pitch / (2 * np.pi) / 0.1, rtol=1e-9)
 
 
 def test_slope_is_the_difference_of_projections():
@@ -143,6 +157,10 @@ def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
     assert decode(folder, folder / "scan", tmp_path / "out") == 0
     said = capsys.readouterr()
     assert "not checked" in said.out and "warning" not in said.err
+    by_source = json.loads((tmp_path / "out" / "decode.json").read_text())
+    for source, sigma_mm in by_source["median_sigma_mm_by_source"].items():
+        assert f"by {source}:" in said.out and f" {sigma_mm:.3f} mm" in said.out
+    assert "an order that is wrong by one would add" in said.out
     assert decode(folder, scan, tmp_path / "out") == 2
     assert "frame_2.png and frame_3.png show the same image" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "out").iterdir()] == [

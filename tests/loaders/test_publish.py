@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import cv2
+import mlcroissant
 import numpy as np
 import pytest
 import yaml
@@ -64,6 +65,7 @@ def test_a_dry_run_says_everything_and_changes_nothing(published):
         [
             *DATA,
             "README.md",
+            "croissant.json",
             "eval.yaml",
             "fpp-bench.json",
             "meshes/bowl.ply",
@@ -156,6 +158,17 @@ def test_a_name_with_markup_is_shown_as_it_is(published, client):
     body = card.split("---\n", 2)[2]
     assert ODD_OBJECT not in body
     assert "&#95;&#95;odd&#95;&#95;-name&#95;" in body
+
+
+def test_the_published_croissant_is_valid(published, client, dataset):
+    content = json.loads(client.server.repos["datasets", "alice/fpp"].files["croissant.json"])
+    read = mlcroissant.Dataset(content)
+    assert not read.metadata.ctx.issues.report()
+    assert [one.name for one in read.metadata.record_sets] == list(dataset.splits)
+    assert content["url"].endswith("datasets/alice/fpp") and content["rai:hasSyntheticData"]
+    first = {field["name"]: field for field in content["recordSet"][0]["field"]}
+    assert first["frame_00"]["dataType"] == "sc:ImageObject"
+    assert first["depth"]["arrayShape"] == ",".join(map(str, SIZE))
 
 
 def test_the_card_describes_columns_and_splits(published, client, dataset):

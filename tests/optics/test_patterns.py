@@ -61,7 +61,7 @@ def test_frames_outside_the_sequence_are_refused(index):
 
 def test_export_is_lossless_and_in_order(tmp_path):
     paths = export_patterns(SMALL, tmp_path / "patterns")
-    assert [path.name for path in paths] == [f"A_{i}.png" for i in range(18)]
+    assert [path.name for path in paths] == [f"A_{i:02}.png" for i in range(18)]
     for index, path in enumerate(paths):
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert image.ndim == 2 and np.array_equal(image, pattern_image(SMALL, index))

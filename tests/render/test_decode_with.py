@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import TINY_SIZE
 
-from fpp_ml_bench.calibration.result import volume_error_mm
+from fpp_ml_bench.calibration.volume import volume_error_mm
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import BuildError, CalibrationError

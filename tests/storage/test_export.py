@@ -2,6 +2,8 @@
 opens."""
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -12,8 +14,11 @@ import scipy.io
 import trimesh
 from conftest import TINY_CONFIGS, TINY_OBJECTS, file_bytes
 from published_trees import command, imported, write_png
+from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError, PredictionError
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import whole_folder
 from fpp_ml_bench.loaders.published.exporting import chosen_splits, export
 from fpp_ml_bench.loaders.published.importing import import_notes
@@ -346,3 +351,55 @@ def test_bad_input_to_the_command_is_a_message_and_status_2(
     assert command("export", *(word.format(data=tiny) for word in words)) == 2
     message = capsys.readouterr().err
     assert "error:" in message and "Traceback" not in message and not Path("out").exists()
+
+
+READ_ROWS = """
+import sys, mlcroissant, numpy as np
+read = mlcroissant.Dataset(sys.argv[1] + "/croissant.json")
+assert not read.metadata.ctx.issues.report()
+assert read.metadata.data_limitations and read.metadata.data_use_cases
+rows = list(read.records("test-rows"))
+depths = {row["test-rows/sample"].decode(): row["test-rows/depth"] for row in rows}
+np.savez(sys.argv[1] + "/read.npz", **{name: np.array(list(d)) for name, d in depths.items()})
+"""
+
+
+def test_croissant_metadata_is_valid_and_reads_the_rows(tmp_path):
+    """In a process of its own: where ``datasets`` is imported, its types of arrays stop pandas, by
+    which mlcroissant reads."""
+    dataset = make_dataset(tmp_path / "dataset", size=(12, 16))
+    export(dataset, tmp_path / "out", ["parquet"], ["test"])
+    words = [sys.executable, "-c", READ_ROWS, str(tmp_path / "out")]
+    subprocess.run(words, check=True, capture_output=True, timeout=120)
+    with np.load(tmp_path / "out" / "read.npz") as read:
+        assert list(read) == dataset.samples("test")
+        assert all(np.array_equal(read[name], dataset.depth_mm(name)) for name in read)
+
+
+def test_depth_maps_are_read_back_by_opencv_and_scored(opened, tmp_path, capsys):
+    dataset = opened
+    predictions = write_predictions(tmp_path / "predictions", dataset, "test", offset_mm=3.0)
+    words = [str(dataset.path), "--split", "test", "--maps"]
+    assert main(["export", *words, "pfm,png,ply", "--out", str(tmp_path / "truth")]) == 0
+    unit_mm = float((tmp_path / "truth" / "png_scale.txt").read_text().split()[0])
+    for sample in dataset.samples("test"):
+        truth = cv2.imread(str(tmp_path / "truth" / f"{sample}.pfm"), cv2.IMREAD_UNCHANGED)
+        levels = cv2.imread(str(tmp_path / "truth" / f"{sample}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(truth, dataset.depth_mm(sample)) and levels.dtype == np.uint16
+        assert np.abs(levels * unit_mm - truth).max() <= unit_mm / 2 * 1.001
+        cloud = trimesh.load(tmp_path / "truth" / f"{sample}.ply")
+        assert len(cloud.vertices) == np.count_nonzero(truth)
+    again = tmp_path / "again"
+    made = ["pfm", "--predictions", str(predictions), "--out", str(again)]
+    assert main(["export", *words, *made]) == 0
+    shutil.copyfile(predictions / "submission.yaml", again / "submission.yaml")
+    scores = [evaluate(folder, dataset, "test").metrics for folder in (predictions, again)]
+    assert scores[0].object_mae_mm == pytest.approx(scores[1].object_mae_mm, rel=1e-6) != 0
+    (again / f"{dataset.samples('test')[0]}.pfm").write_bytes(b"Pf\n176 176\n-1.0\n1234")
+    with pytest.raises(PredictionError, match="holds 4 bytes of values, expected 123904"):
+        evaluate(again, dataset, "test")
+    capsys.readouterr()
+    assert main(["export", *words, "exr", "--out", str(tmp_path / "none")]) == 2
+    assert "expected some of pfm, png, ply" in capsys.readouterr().err
+    assert main(["export", str(dataset.path), *made[1:]]) == 2
+    assert "--predictions: needs --maps" in capsys.readouterr().err
