@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.training.weights import NetConfig, WeightsFile
     from fpp_ml_bench.evaluation.submission.description import Submission
 
-NETWORKS = ("fringe-net-42",)
+NETWORKS = ("fringe-net-42", "fringe-net-1", "fringe-net-2")
 """Weights of the networks that come with the package."""
 MEMBERS = len(NETWORKS)
 
