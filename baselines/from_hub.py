@@ -34,7 +34,7 @@ class MethodEntry(StrictModel):
     this repository, None for a network from image to depth; and its ``options``."""
 
     method: Text | None = None
-    options: Annotated[dict[Text, Scalar], Field(default_factory=dict), AfterValidator(_no_paths)]
+    options: Annotated[dict[Text, Scalar], AfterValidator(_no_paths)] = Field(default_factory=dict)
     weights: Annotated[str | None, Field(pattern=r"^[A-Za-z0-9_-]+\.safetensors$")] = None
 
 

@@ -218,12 +218,10 @@ class Plan:
         has_threads = "threads" in {
             field.name for field in fields(find(point.method).method.Options)
         }
-        return load_method(
-            point.method,
-            source,
-            **point.options,
-            **({"threads": self.threads} if has_threads else {}),
-        )
+        options: dict[str, Any] = dict(point.options)
+        if has_threads:
+            options["threads"] = self.threads
+        return load_method(point.method, source, **options)
 
     def timed(self, call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
         """Median seconds of a call, of `RUNS` or of fewer once `LIMIT_S` is used up, after one that

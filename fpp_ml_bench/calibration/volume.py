@@ -138,7 +138,9 @@ def moved(rig: Rig, change: NDArray[np.float64]) -> Rig:
         end = start + LENS_VALUES + len(terms)
         lens, bent = change[start : start + LENS_VALUES], change[start + LENS_VALUES : end]
         values = np.array([device.fx, device.fy, device.cx, device.cy]) + lens
-        devices.append(Pinhole(device.width, device.height, *values, tuple(terms + bent)))
+        fx, fy, cx, cy = values.tolist()
+        bend = tuple((terms + bent).tolist())
+        devices.append(Pinhole(device.width, device.height, fx, fy, cx, cy, bend))
         start = end
     turn = cv2.Rodrigues(cv2.Rodrigues(rig.R)[0].ravel() + change[start : start + 3])[0]
     x, y, z = rig.t + change[start + 3 :] / MM_PER_M

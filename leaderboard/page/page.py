@@ -212,7 +212,7 @@ def _score_cells(row: Row) -> list[tuple[str, str, str]]:
     cells = []
     for key in (*RANKED, *(key for key in METRICS if key not in RANKED)):
         if (value := getattr(row.metrics, key)) is not None:
-            title = key.removesuffix("_mm").replace("_", " ")
+            title = METRICS[key].title
             cells.append((title, score_text(key, value), interval_text(row.intervals.of(key))))
     return cells
 

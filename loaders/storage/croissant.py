@@ -135,7 +135,7 @@ def _records(split: str, described: Mapping[str, Mapping[str, Any]]) -> dict[str
 
 def _responsible(manifest: Manifest, generated: bool) -> dict[str, Any]:
     """How the data came about, what it is for and what it lacks."""
-    made = ", ".join(f"{name} {version}" for name, version in manifest.generator.items())
+    made = " ".join(manifest.generator.values())
     if generated:
         collected = "Rendered by a model of projector, surfaces and camera; nobody was observed."
         biases = (

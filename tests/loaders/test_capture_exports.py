@@ -110,8 +110,13 @@ def written(tmp_path):
 
 def test_arrays_come_back_in_other_readers(written):
     depth, _, files = written
-    assert sorted(files) == ["depth.mat", "depth.npy", "depth_0.1mm.png", "mesh.ply", "points.ply"]
-    for read in (np.load(files["depth.npy"]), scipy.io.loadmat(files["depth.mat"])["depthMap"]):
+    arrays = "depth.mat", "depth.npy", "depth.pfm"
+    assert sorted(files) == [*arrays, "depth_0.1mm.png", "mesh.ply", "points.ply"]
+    for read in (
+        np.load(files["depth.npy"]),
+        scipy.io.loadmat(files["depth.mat"])["depthMap"],
+        cv2.imread(str(files["depth.pfm"]), cv2.IMREAD_UNCHANGED),
+    ):
         assert read.dtype == np.float32 and np.array_equal(read, depth)
     levels = cv2.imread(str(files["depth_0.1mm.png"]), cv2.IMREAD_UNCHANGED)
     assert levels.dtype == np.uint16 and np.array_equal(levels > 0, depth > 0)
@@ -199,7 +204,11 @@ NAN = np.where(np.arange(64) == 3, np.nan, PLANE_MM)
             {"grey": np.full((48, 64), 256.0)},
             "grey: expected finite numbers from 0 to 255, got 3072",
         ),
-        (PLANE_MM, {"forms": ["obj"]}, "forms: expected some of npy, mat, png, ply, mesh, got obj"),
+        (
+            PLANE_MM,
+            {"forms": ["obj"]},
+            "forms: expected some of npy, mat, png, pfm, ply, mesh, got obj",
+        ),
         (PLANE_MM, {"forms": []}, "forms: expected some of .*got none"),
     ],
 )
@@ -242,7 +251,7 @@ def test_what_a_decoding_wrote_is_removed_the_report_first(tmp_path, monkeypatch
     folder = _filled(tmp_path / "out")
     removed.clear()
     clear_outputs(folder)
-    assert removed[0] == "decode.json" and len(removed) == 12 and not list(folder.iterdir())
+    assert removed[0] == "decode.json" and len(removed) == 13 and not list(folder.iterdir())
     clear_outputs(folder)
     clear_outputs(tmp_path / "absent")
     assert not (tmp_path / "absent").exists()
