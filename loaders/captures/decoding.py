@@ -526,7 +526,8 @@ def calibrated_rig(
 ) -> Rig:
     """The rig of a calibration, with the sequence of ``stand_in``; its working range is
     ``range_mm``, or that of the boards' points and a margin. Its error is what the calibration's
-    covariance leaves at half of the points of its volume."""
+    covariance leaves at half of the points of its volume. Raises `CalibrationError` where that is
+    nothing known."""
     depths = [
         calibration.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2]
         for pose in calibration.poses
@@ -542,4 +543,10 @@ def calibrated_rig(
         rotation=calibration.rotation,
         translation_m=calibration.translation_m,
     ).with_range((near, far))
-    return replace(rig, calibration_px=depth_spread(Places.over(rig), calibration.root).median_px)
+    error_px = depth_spread(Places.over(rig), calibration.root).median_px
+    if not np.isfinite(error_px):
+        raise CalibrationError(
+            "the poses leave the depth of half of the working range undetermined: show the board "
+            "over the whole image and range, or give a lens with fewer terms (--lens radial-1)"
+        )
+    return replace(rig, calibration_px=error_px)
