@@ -536,13 +536,7 @@ def calibrated_rig(
         float(np.min(depths)) * (1 - RANGE_MARGIN),
         float(np.max(depths)) * (1 + RANGE_MARGIN),
     )
-    rig = replace(
-        stand_in,
-        camera=calibration.camera.pinhole,
-        projector=calibration.projector.pinhole,
-        rotation=calibration.rotation,
-        translation_m=calibration.translation_m,
-    ).with_range((near, far))
+    rig = calibration.applied_to(stand_in).with_range((near, far))
     error_px = depth_spread(Places.over(rig), calibration.root).median_px
     if not np.isfinite(error_px):
         raise CalibrationError(
