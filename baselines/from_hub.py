@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, Field
 
-from fpp_ml_bench.errors import PredictionError, RemoteError
+from fpp_ml_bench.errors import PredictionError, PublishError, RemoteError
 from fpp_ml_bench.files import is_file, printable, read_json
 from fpp_ml_bench.loaders.hub import Hub, check_repo_name
 from fpp_ml_bench.schema import Scalar, StrictModel, Text, validate
@@ -54,7 +54,7 @@ def fetched(address: str, trust: bool = False) -> Fetched:
     repo, _, revision = address.removeprefix(SCHEME).partition(REVISION)
     try:
         check_repo_name(repo)
-    except Exception as error:
+    except PublishError as error:
         raise PredictionError(
             f"{printable(address, 200)}: expected hf://OWNER/NAME or hf://OWNER/NAME@REVISION"
         ) from error

@@ -103,16 +103,6 @@ def measured(
     return decoded.depth_mm[where], depth_budget_mm(decoded, rig, noise_grey, {})
 
 
-def found_rig(rig: Rig, calibration: Calibration) -> Rig:
-    return replace(
-        rig,
-        camera=calibration.camera.pinhole,
-        projector=calibration.projector.pinhole,
-        rotation=calibration.rotation,
-        translation_m=calibration.translation_m,
-    )
-
-
 def monte_carlo(rig: Rig, count: int) -> Table:
     """Calibration and noise anew in every draw, at ten places."""
     scenes = planes(rig, noisy=True)
@@ -129,7 +119,7 @@ def monte_carlo(rig: Rig, count: int) -> Table:
     errors, by_noise, by_calibration, silent = np.zeros((4, count, len(exact)))
     true_places = Places.at(rig, columns.astype(float), rows.astype(float), exact[None])
     for draw, calibration in enumerate(drawn_calibrations(rig, count)):
-        found = found_rig(rig, calibration)
+        found = calibration.applied_to(rig)
         results = [
             measured(frames, found, mask)
             for frames, mask in zip(captures[draw % CAPTURES], masks, strict=True)

@@ -2,7 +2,7 @@
 it is of each; its residuals as a picture."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -16,6 +16,8 @@ from fpp_ml_bench.style import DEPTH_COLOURS, SIGMA_COLOURS, figure, figure_png,
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from fpp_ml_bench.optics.rig import Rig
 
 MODELS = {
     "none": (),
@@ -167,6 +169,16 @@ class Calibration:
     def translation_m(self) -> tuple[float, float, float]:
         x, y, z = (length / MM_PER_M for length in self.translation_mm)
         return x, y, z
+
+    def applied_to(self, rig: "Rig") -> "Rig":
+        """``rig`` with the devices that were found, and the pose between them."""
+        return replace(
+            rig,
+            camera=self.camera.pinhole,
+            projector=self.projector.pinhole,
+            rotation=self.rotation,
+            translation_m=self.translation_m,
+        )
 
     @property
     def held_out_rms_px(self) -> float:

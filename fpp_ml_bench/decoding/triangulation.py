@@ -46,10 +46,10 @@ fewer the direction is left out."""
 _BRIGHTNESSES = 12
 """Groups of as many pixels each, by brightness, in which noise is estimated: noise grows with
 light, and the line through them needs several."""
-ROUNDING_GREY = 12**-0.5
-"""Standard deviation of rounding to whole grey levels: that of an even distribution of width 1."""
 _LEAST_VARIANCE = 1 / 12
 """Least variance of noise in squared grey levels: that of rounding to whole grey levels."""
+ROUNDING_GREY = _LEAST_VARIANCE**0.5
+"""Its standard deviation: that of an even distribution of width 1."""
 _HIGHEST_HARMONIC = 4
 """Highest harmonic of a fringe that is taken for the response of projector or camera (gamma):
 higher ones are weak, and each takes freedom from the noise."""

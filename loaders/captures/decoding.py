@@ -526,7 +526,8 @@ def calibrated_rig(
 ) -> Rig:
     """The rig of a calibration, with the sequence of ``stand_in``; its working range is
     ``range_mm``, or that of the boards' points and a margin. Its error is what the calibration's
-    covariance leaves at half of the points of its volume."""
+    covariance leaves at half of the points of its volume. Raises `CalibrationError` where that is
+    nothing known."""
     depths = [
         calibration.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2]
         for pose in calibration.poses
@@ -535,11 +536,11 @@ def calibrated_rig(
         float(np.min(depths)) * (1 - RANGE_MARGIN),
         float(np.max(depths)) * (1 + RANGE_MARGIN),
     )
-    rig = replace(
-        stand_in,
-        camera=calibration.camera.pinhole,
-        projector=calibration.projector.pinhole,
-        rotation=calibration.rotation,
-        translation_m=calibration.translation_m,
-    ).with_range((near, far))
-    return replace(rig, calibration_px=depth_spread(Places.over(rig), calibration.root).median_px)
+    rig = calibration.applied_to(stand_in).with_range((near, far))
+    error_px = depth_spread(Places.over(rig), calibration.root).median_px
+    if not np.isfinite(error_px):
+        raise CalibrationError(
+            "the poses leave the depth of half of the working range undetermined: show the board "
+            "over the whole image and range, or give a lens with fewer terms (--lens radial-1)"
+        )
+    return replace(rig, calibration_px=error_px)

@@ -90,13 +90,7 @@ def test_a_photographed_board_gives_the_rig_back_and_a_wrong_spacing_shows(captu
     assert (
         found.rms_px.camera < 0.05 and found.rms_px.projector < 0.1
     )  # an image px is 2.6 projector px
-    rig = replace(
-        true,
-        camera=found.camera.pinhole,
-        projector=found.projector.pinhole,
-        rotation=found.rotation,
-        translation_m=found.translation_m,
-    )
+    rig = found.applied_to(true)
     error = volume_error_mm(rig, true)
     assert error.scale == pytest.approx(spacing_given, abs=0.002)
     if spacing_given == 1:
@@ -145,13 +139,7 @@ def test_a_calibration_says_how_wrong_the_depth_by_it_is():
             poses.append(Pose(f"{name}", size, seen, known))
         lenses = Lens("none"), Lens("none")
         found = calibrate(poses, board, size, of_projector, lenses, hold_out=False)
-        own = replace(
-            rig,
-            camera=found.camera.pinhole,
-            projector=found.projector.pinhole,
-            rotation=found.rotation,
-            translation_m=found.translation_m,
-        )
+        own = found.applied_to(rig)
         error = Places.over(rig).found_mm(own) - Places.over(rig).depth_mm
         relative.append(error / depth_spread(Places.over(own), found.root).mm)
     # Points share a calibration's error, so that there are about twelve independent values.
