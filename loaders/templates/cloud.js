@@ -65,7 +65,8 @@
   gl.clearColor(0.082, 0.094, 0.11, 1);
 
   const spacing = Math.sqrt(((most[0] - least[0] || 1) * (most[1] - least[1] || 1)) / count) / radius;
-  let yaw, pitch, zoom, byDepth = false, waiting = false;
+  let [yaw, pitch, zoom] = [0.5, 0.35, 1]; // opens turned, so that the surface shows its relief
+  let byDepth = true, waiting = false;
 
   const draw = () => {
     waiting = false;
@@ -98,7 +99,7 @@
     zoom = Math.max(0.2, Math.min(50, zoom * factor));
     redraw();
   };
-  const reset = () => {
+  const camera = () => {
     [yaw, pitch, zoom] = [0, 0, 1];
     redraw();
   };
@@ -112,7 +113,7 @@
 
   const KEYS = {
     ArrowLeft: () => turn(-0.1, 0), ArrowRight: () => turn(0.1, 0), ArrowUp: () => turn(0, -0.1), ArrowDown: () => turn(0, 0.1),
-    "+": () => zoomBy(1.15), "=": () => zoomBy(1.15), "-": () => zoomBy(1 / 1.15), r: reset, R: reset,
+    "+": () => zoomBy(1.15), "=": () => zoomBy(1.15), "-": () => zoomBy(1 / 1.15), r: camera, R: camera,
   };
   canvas.addEventListener("keydown", (event) => {
     if (!(event.key in KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -145,7 +146,7 @@
   element("depth").addEventListener("click", () => colourByDepth(true));
   element("nearer").addEventListener("click", () => zoomBy(1.25));
   element("farther").addEventListener("click", () => zoomBy(0.8));
-  element("reset").addEventListener("click", reset);
+  element("camera").addEventListener("click", camera);
   new ResizeObserver(redraw).observe(canvas);
-  reset();
+  colourByDepth(true);
 })();

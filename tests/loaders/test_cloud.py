@@ -157,10 +157,17 @@ def test_page_in_a_browser(browser, tmp_path):
     browser.open(page, width, 844, dark=True)
     assert browser.run("document.documentElement.scrollWidth") <= width
     assert browser.run("document.getElementById('without').hidden") is True
+    opened = _pixels(browser)
+    assert 0.02 < _drawn(opened).mean() < 0.9
+    # It opens coloured by depth and turned.
+    assert np.ptp(opened, axis=-1).max() > 60
+    assert browser.run("document.getElementById('scale').hidden") is False
+    browser.click("#camera")
+    assert np.abs(_pixels(browser) - opened).max() > 8
+    browser.click("#grey")
     first = _pixels(browser)
-    assert 0.02 < _drawn(first).mean() < 0.9
-    # The first view is the camera's: the bowl is round there, and its darker half, with the first
-    # rows, is above.
+    assert browser.run("document.getElementById('scale').hidden") is True
+    # In the camera's view the bowl is round, and its darker half, with the first rows, is above.
     rows, columns = np.nonzero(_drawn(first))
     assert np.ptp(rows) == pytest.approx(np.ptp(columns), rel=0.1)
     top, bottom = (first[_drawn(first) & half].mean() for half in _halves(first, rows))
@@ -203,6 +210,8 @@ def test_the_near_side_follows_the_pointer(browser, tmp_path):
         cloud_html("knob", np.concatenate([plane, knob]), grey)
     )
     browser.open(page, 900, 844)
+    browser.click("#camera")
+    browser.click("#grey")
 
     def place() -> np.ndarray:
         return np.argwhere(_pixels(browser).min(axis=-1) > 200).mean(axis=0)
