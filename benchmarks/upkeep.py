@@ -581,7 +581,7 @@ def write_robustness(args: argparse.Namespace) -> None:
     results = list(map(read_result, expand(args.results)))
     rows = {name: of_set(name, results) for name in SETS}
     blocks = {name: robustness_tables(rows[name]) for name in SETS}
-    words = "Error against severity for each axis, a line for each of five methods"
+    words = "Error against severity for each axis, a line for each of four methods"
     blocks["test"] += f"\n![{words}](../pictures/{CURVES})\n"
     write_atomically(args.page, filled(args.page, blocks).encode())
     write_atomically(args.page.parent.parent / "pictures" / CURVES, curves(rows["test"]))
