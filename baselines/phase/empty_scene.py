@@ -203,9 +203,8 @@ class EmptyScene:
         places = np.nonzero(plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
         row, column = (SAMPLE_STEP_PX * place for place in places)
         sampled = grey[row, column].astype(np.float64)
-        terms = np.stack(
-            [np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1
-        )
+        columns = [np.ones_like(sampled)] + [term[row, column] for term in self._terms]
+        terms = np.stack(columns, axis=1).astype(np.float64)
         fitted, solution = _least_squares(terms, sampled, rounds=1)
         noise = _noise_of(sampled - fitted)
         ambient_grey, *weights = solution
