@@ -48,7 +48,6 @@ def save_fringe_net(path, **changes):
         "name": "mine",
         "title": "Small",
         "options": NET_OPTIONS,
-        "threshold": -1.0,
         "dataset_fingerprint": "0" * 64,
         "recipe": {},
     }
