@@ -158,7 +158,7 @@ def test_two_axes_are_held_out_of_all_drawn_lights_and_the_rest_is_named():
 
 def test_what_a_training_drew_is_said_by_its_recipe():
     class Learned(Noisy):
-        weights_config = SimpleNamespace(recipe={"lights": 30})
+        weights_config = SimpleNamespace(recipe={"held_out": []})
 
     before = Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn
     assert "camera-blur" in before and "dark-paint" not in before and "motion" not in before
