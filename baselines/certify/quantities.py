@@ -24,6 +24,9 @@ REJECTED = 0.003
 """Share of the points that a fit may leave out: 3 in 1000, as VDI/VDE 2634 part 2 is said to."""
 INNER_SHARE = 0.95
 """Of the points whose shell a dispersion is, after ISO 10360-13."""
+MOST_RADII = 10.0
+"""Of a true radius, that a fitted sphere may have: points that fit a larger one lie on no sphere,
+and a plane fits as well."""
 FEWEST_POINTS = 100
 """Points of a part below which nothing is fitted."""
 RISE = 0.1, 0.9
@@ -218,14 +221,18 @@ def _symbols(gauge: Gauge) -> tuple[str, ...]:
 
 
 def _values(gauge: Gauge, points: Sequence[Points], unit_mm: float) -> dict[str, float]:
+    """By symbol; none where the points of a sphere lie on no sphere."""
     surfaces = gauge.surfaces
     if surfaces[0].radius_m is not None:
         fits = [fit_sphere(one) for one in points]
+        true_mm = unit_mm * surfaces[0].radius_m
+        if any(fit.values[3] > MOST_RADII * true_mm for fit in fits):
+            return {}
         if gauge.kind == "ball bar":
             apart = np.linalg.norm(fits[1].values[:3] - fits[0].values[:3])
             spacing = unit_mm * np.linalg.norm(surfaces[1].point_m - surfaces[0].point_m)
             return {"SD": float(apart - spacing)}
-        size = 2 * (fits[0].values[3] - unit_mm * surfaces[0].radius_m)
+        size = 2 * (fits[0].values[3] - true_mm)
         return {"PF": fits[0].range_mm, "PF95": fits[0].inner_mm, "PS": float(size)}
     fits = [fit_plane(one) for one in points]
     if gauge.kind == "plane":

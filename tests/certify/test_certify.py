@@ -137,7 +137,7 @@ def test_errors_put_in_on_purpose_are_recovered():
     assert values_of(wedge, np.where(part >= 0, (exact_mm + flatter) / 2, 0))["W"] > 10
 
 
-def test_a_point_without_an_answer_is_refused_and_nothing_is_fitted_to_too_few():
+def test_a_point_without_an_answer_is_refused_and_no_sphere_is_fitted_to_too_few_or_to_a_plane():
     sphere = of_kind("sphere")
     part, exact_mm = seen(sphere)
     half = np.where(RAYS[0] < sphere.surfaces[0].point_m[0] / 1.8, exact_mm, 0)
@@ -145,6 +145,8 @@ def test_a_point_without_an_answer_is_refused_and_nothing_is_fitted_to_too_few()
     assert result.refused == pytest.approx(0.5, abs=0.02) and abs(result.values["PS"]) < 1e-6
     none = measure(sphere, part, exact_mm, np.zeros_like(exact_mm), RAYS)
     assert none.refused == 1 and set(none.values.values()) == {None}
+    flat = measure(sphere, part, exact_mm, np.full_like(exact_mm, exact_mm.max()), RAYS)
+    assert flat.refused == 0 and set(flat.values.values()) == {None}
 
 
 def test_corners_of_a_plane_and_their_distances_are_found():
