@@ -9,13 +9,18 @@ since camera and projector get theirs from the same label. They are never mirror
 """
 
 from dataclasses import dataclass
-from typing import Any
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.style import figure, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 KINDS = ("checker", "circles", "circles-asymmetric", "charuco")
 SUBPIX_SHARE = 0.17
@@ -41,6 +46,10 @@ DICTIONARIES = (
 )
 """Those that hold all markers which boards are printed with: the smaller ones are their
 beginnings."""
+SHEET_MARGIN = 2
+"""Spacings from the outermost points to the edge of a printed sheet: the squares of a checker reach
+one spacing beyond its inner corners, and finders need white around them."""
+MM_PER_INCH = 25.4
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
 """Where OpenCV's search for a corner stops: after 100 steps, or at a step below 1e-5 px, far below
 the error of a corner."""
@@ -280,3 +289,51 @@ def parse_board(text: str) -> Board:
             f"with a radius of 6 mm, got {text!r}"
         ) from None
     return Board(kind, columns, rows, spacing_mm, detail_mm, dictionary)
+
+
+@styled
+def draw_board(board: Board) -> "Figure":
+    """A sheet to print at its true size, with a white margin: a figure of the sheet's size. Raises
+    `CalibrationError` for circles whose radius is not given, or with which they touch."""
+    from matplotlib.patches import Circle, Rectangle
+
+    circles, spacing = board.kind.startswith("circles"), board.spacing_mm
+    if circles and not 0 < board.radius_mm < spacing / 2:
+        raise CalibrationError(
+            f"board {board}: to print it, give the circles' radius in mm, below half of their "
+            f"spacing, as in circles:5x9:20:6; got {board.radius_mm:g}"
+        )
+    points_mm = board.points_mm()[:, :2]
+    (left, top), (right, bottom) = (
+        points_mm.min(axis=0) - SHEET_MARGIN * spacing,
+        points_mm.max(axis=0) + SHEET_MARGIN * spacing,
+    )
+    sheet = figure((right - left) / MM_PER_INCH, (bottom - top) / MM_PER_INCH, layout=None)
+    axes = sheet.add_axes((0, 0, 1, 1), xlim=(left, right), ylim=(bottom, top))
+    axes.set_axis_off()
+    if circles:
+        for centre in points_mm:
+            axes.add_patch(Circle(centre, board.radius_mm, color="black", linewidth=0))
+        return sheet
+    for row in range(board.rows + 1):
+        for column in range(row % 2, board.columns + 1, 2):
+            corner = (spacing * (column - 1), spacing * (row - 1))
+            axes.add_patch(Rectangle(corner, spacing, spacing, color="black", linewidth=0))
+    if board.kind == "charuco":
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+        squares = (board.columns + 1, board.rows + 1)
+        markers = cv2.aruco.CharucoBoard(squares, spacing, board.detail_mm, dictionary)
+        cells = dictionary.markerSize + 2  # with the black border
+        for number, corners in zip(markers.getIds(), markers.getObjPoints(), strict=True):
+            image = cv2.aruco.generateImageMarker(dictionary, int(number), cells)
+            (x0, y0), (x1, y1) = (corners[corner, :2] - spacing for corner in (0, 2))
+            axes.imshow(image, "gray", extent=(x0, x1, y1, y0), interpolation="none", aspect="auto")
+        axes.set(xlim=(left, right), ylim=(bottom, top))
+    return sheet
+
+
+def board_pdf(board: Board) -> bytes:
+    """`draw_board` as PDF: the same bytes each time."""
+    content = BytesIO()
+    draw_board(board).savefig(content, format="pdf", metadata={"CreationDate": None})
+    return content.getvalue()

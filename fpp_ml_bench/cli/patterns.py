@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from fpp_ml_bench.calibration.boards import board_pdf, parse_board
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command, given, value
 from fpp_ml_bench.coding.crossed import Crossed
@@ -48,6 +49,7 @@ def _family(text: str) -> "Crossed":
         raise ValueError(str(error)) from error
 
 
+BOARD_FILE = "board.pdf"
 PERIODS = value(
     "numbers such as 12,14,18 or 12-18",
     _numbers,
@@ -89,6 +91,9 @@ class PatternSettings(DesignSettings):
         "pair (.yaml, .json)",
         "DIR|FILE",
     )
+    board: str | None = option(
+        None, "also write board.pdf, a calibration board to print without scaling", "KIND:CxR:MM"
+    )
     design: bool = option(
         False,
         "write no images: find two carriers of crossed fringes with the least expected error, and "
@@ -101,6 +106,7 @@ class PatternSettings(DesignSettings):
 fpp-bench patterns rig.yaml --out patterns           patterns/A_00.png, A_01.png, ... and patterns.json
 fpp-bench patterns paper --out patterns              the paper's 52 frames
 fpp-bench patterns crossed --out patterns            the same after three crossed frames
+fpp-bench patterns rig.yaml --out patterns --board charuco:7x10:20:15     and a board to print, for the calibration
 
 RIG may be a whole rig file, or one with the entries projector: {width: ..., height: ...} and sequence alone,
 since patterns come before the calibration. Project them without scaling; capture an image each, in this order.
@@ -144,12 +150,18 @@ def patterns(settings: PatternSettings) -> None:
         "frames": frames,
     }
     files["patterns.json"] = (json.dumps(content, indent=1) + "\n").encode()
+    if settings.board is not None:
+        files[BOARD_FILE] = board_pdf(parse_board(settings.board))
     if not holds(out, files):  # written by the same command, which was killed before it said so
         never = "give a new folder, so that no old pattern is projected by mistake"
         with whole_folder(out, "writing patterns there", CaptureError, never) as folder:
             write_files(folder, files, CaptureError)
     size = f"{rig.projector.width} x {rig.projector.height} px"
     print(f"{out}: {len(names)} images of {size}, {first} to {last}, and patterns.json")
+    if settings.board is not None:
+        print(
+            f"{out / BOARD_FILE}: {settings.board}; print it without scaling, measure its spacing"
+        )
     print(
         "next: project them in this order, one capture each; then fpp-bench decode RIG CAPTURE "
         "--out OUT"

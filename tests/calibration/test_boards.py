@@ -1,10 +1,12 @@
 """Boards: drawn through a known homography and found again, and what is refused."""
 
+from io import BytesIO
+
 import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.calibration.boards import Board, parse_board
+from fpp_ml_bench.calibration.boards import Board, board_pdf, draw_board, parse_board
 from fpp_ml_bench.errors import CalibrationError
 
 TO_IMAGE = np.array([[3.0, 0.35, 90.0], [-0.25, 2.8, 110.0], [0.0009, 0.0011, 1.0]])
@@ -69,6 +71,35 @@ def test_drawn_boards_are_found(text, tolerance_px):
     if np.abs(corners - turned).mean() < np.abs(corners - expected).mean():
         expected = turned
     assert np.sqrt(((corners - expected) ** 2).sum(1).mean()) < tolerance_px
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "checker:7x5:10",
+        "circles:7x5:10:2.5",
+        "circles-asymmetric:4x7:8:2.5",
+        "charuco:5x6:10:7:DICT_5X5_50",
+    ],
+)
+def test_the_sheet_to_print_has_the_points_where_the_board_says(text):
+    board, px_per_mm = parse_board(text), 6
+    content = BytesIO()
+    draw_board(board).savefig(content, format="png", dpi=25.4 * px_per_mm)
+    image = cv2.imdecode(np.frombuffer(content.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    points_mm = board.points_mm()[:, :2]
+    size_mm = np.ptp(points_mm, axis=0) + 4 * board.spacing_mm
+    np.testing.assert_allclose(image.shape[::-1], px_per_mm * size_mm, atol=1)
+    expected = px_per_mm * (points_mm + 2 * board.spacing_mm) - 0.5
+    corners = board.find(image)
+    errors = [np.abs(order - expected).max() for order in (corners, corners[::-1])]
+    assert min(errors) < 0.3
+    assert board_pdf(board) == board_pdf(board) and board_pdf(board).startswith(b"%PDF")
+
+
+def test_a_sheet_of_circles_needs_their_radius():
+    with pytest.raises(CalibrationError, match="give the circles' radius in mm"):
+        draw_board(parse_board("circles:5x9:20"))
 
 
 @pytest.mark.parametrize("hidden", [False, True])

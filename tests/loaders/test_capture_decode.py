@@ -275,13 +275,14 @@ def test_patterns_come_with_a_manifest(tmp_path, capsys):
         "projector: {width: 200, height: 100}\n"
         "sequence: {order: [white, vertical, black], vertical: {scheme: gray, cell_px: 2}}\n"
     )
-    assert main(["patterns", str(file), "--out", str(tmp_path / "images")]) == 0
+    again = ["patterns", str(file), "--out", str(tmp_path / "images"), "--board", "checker:9x13:10"]
+    assert main(again) == 0
+    assert (tmp_path / "images" / "board.pdf").read_bytes().startswith(b"%PDF")
     manifest = json.loads((tmp_path / "images" / "patterns.json").read_text())
     assert manifest["projector_px"] == [200, 100] and len(manifest["frames"]) == 9
     assert manifest["frames"][1]["shows"] == "vertical Gray bit 0"
     white = cv2.imread(str(tmp_path / "images" / "A_0.png"), cv2.IMREAD_UNCHANGED)
     assert white.shape == (100, 200) and (white == 255).all()
-    again = ["patterns", str(file), "--out", str(tmp_path / "images")]
     assert main(again) == 0  # the whole set is there
     (tmp_path / "images" / "A_1.png").write_bytes(b"other")
     assert main(again) == 2
