@@ -33,7 +33,7 @@ from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.loaders.hub import MARK, PICTURE, Publication, card_head, mark_bytes
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
-from fpp_ml_bench.loaders.storage.card import NAME, card_end, yaml_text
+from fpp_ml_bench.loaders.storage.card import NAME, card_end, title, yaml_text
 from fpp_ml_bench.loaders.storage.parquet import published_features
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import millimetres, percent
@@ -46,7 +46,7 @@ SCORE_TEXT = "score = 100 / (1 + object MAE / 10 mm), higher is better"
 _SCORE_DIGITS = 6
 CARD_FILE, EVAL_FILE, RESULT_FOLDER = "README.md", "eval.yaml", ".eval_results"
 _BODY = """\
-# FPP-ML-Bench: single-shot fringe projection profilometry
+# {title}: single-shot fringe projection profilometry
 
 ![Above: the first frame of some objects. Below: their depth, near yellow, far blue, background black.]({picture})
 
@@ -147,6 +147,7 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
             f"| {split} | {len(samples)} | {', '.join(markdown_text(name) for name in objects)} |"
         )
     body = _BODY.format(
+        title=title(dataset.manifest),
         rows=sum(len(samples) for samples in dataset.splits.values()),
         height=dataset.size[0],
         width=dataset.size[1],

@@ -22,6 +22,7 @@ from fpp_ml_bench.optics.rig_file import rig_from_dict, save_rig
 
 RIG_FILE = "rig.yaml"
 NAME = "FPP-ML-Bench"
+"""Of the data that the generator makes; of other data we are not the authors."""
 DOI = "10.1117/12.3082257"
 """Of the paper whose benchmark it builds on."""
 _FOLDER_TEXT = """\
@@ -103,6 +104,11 @@ def default_licence(manifest: Manifest) -> str:
     return "unknown" if manifest.origin == CAPTURED else "mit"
 
 
+def title(manifest: Manifest) -> str:
+    """What a dataset is called where it has no name of its own."""
+    return NAME if manifest.origin == GENERATED else "Fringe images with depth"
+
+
 def front_matter(
     manifest: Manifest,
     configs: list[Any],
@@ -115,7 +121,7 @@ def front_matter(
     rows = sum(map(len, manifest.samples.values()))
     head = {
         "license": licence or default_licence(manifest),
-        "pretty_name": NAME,
+        "pretty_name": title(manifest),
         "task_categories": ["depth-estimation"],
         "size_categories": [
             "n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"
@@ -145,10 +151,10 @@ def card(manifest: Manifest, configs: list[Any], form: str, rows: int, text: str
     """The card of a folder with ``rows`` of the dataset in some ``form``; ``text`` says how to open
     it."""
     height, width = manifest.size
-    title = f"# {NAME} dataset ({manifest.origin}){form}"
     counts = f"{rows} samples of {height} x {width} px; depth in mm, 0 = background."
     end = card_end(manifest, manifest.features())
-    return f"{front_matter(manifest, configs)}{title}\n\n{counts} {text}\n{end}".encode()
+    head = f"{front_matter(manifest, configs)}# {title(manifest)} ({manifest.origin}){form}"
+    return f"{head}\n\n{counts} {text}\n{end}".encode()
 
 
 def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> str:

@@ -3,11 +3,12 @@ for: what tools and forms read of a dataset, https://docs.mlcommons.org/croissan
 
 import json
 from collections.abc import Mapping, Sequence
+from datetime import date
 from typing import Any
 
 from fpp_ml_bench import RELEASED
 from fpp_ml_bench.loaders.sample import MEANINGS
-from fpp_ml_bench.loaders.storage.card import DOI, NAME, limitations
+from fpp_ml_bench.loaders.storage.card import DOI, NAME, limitations, title
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
 
 FILE = "croissant.json"
@@ -57,6 +58,7 @@ def croissant(
     address = (
         f"https://huggingface.co/datasets/{repository}" if repository else f"https://doi.org/{DOI}"
     )
+    owner = f"The {NAME} authors" if generated else repository.partition("/")[0] or "not named"
     files: list[dict[str, Any]] = []
     if repository:
         files.append(
@@ -88,7 +90,8 @@ def croissant(
             "http://mlcommons.org/croissant/1.1",
             "http://mlcommons.org/croissant/RAI/1.0",
         ],
-        "name": repository.rpartition("/")[2] or f"{NAME}-{manifest.origin}",
+        "name": repository.rpartition("/")[2]
+        or f"{title(manifest)} {manifest.origin}".replace(" ", "-"),
         "description": (
             f"Frames of fringe projection and depth in mm, {manifest.size[1]} x "
             f"{manifest.size[0]} px, {manifest.origin}; fingerprint {manifest.fingerprint}."
@@ -98,8 +101,9 @@ def croissant(
         if licence == "unknown"
         else f"https://choosealicense.com/licenses/{licence}/",
         "version": f"1.0.{int(manifest.fingerprint[:7], 16)}",
-        "datePublished": RELEASED,
-        "creator": {"@type": "sc:Organization", "name": f"The {NAME} authors"},
+        # Of other people's data it is not known when they were published, and by whom.
+        "datePublished": RELEASED if generated else date.today().isoformat(),
+        "creator": {"@type": "sc:Organization", "name": owner},
         "keywords": ["fringe projection profilometry", "structured light", "depth estimation"],
         "citeAs": f"Haroon et al., https://doi.org/{DOI}",
         **_responsible(manifest, generated),

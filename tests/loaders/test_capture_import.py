@@ -160,6 +160,10 @@ def test_captures_become_a_dataset_like_any_other(scanned, capsys):
     assert cv2.imread(str(scanned / "b.png")).shape[:2] == (93 + 18, 2 * 2 * 120 + 8)
     assert "license: unknown" in (folder / "README.md").read_text()
     assert run("export", folder, "--out", scanned / "tree", "--mat") == 2
+    assert run("export", folder, "--out", scanned / "rows", "--parquet") == 0
+    exported = (scanned / "rows" / "README.md").read_text()
+    assert "# Fringe images with depth (captured), Parquet" in exported
+    assert "FPP-ML-Bench authors" not in (scanned / "rows" / "croissant.json").read_text()
 
     assert run("predict", "classical", folder, "--out", scanned / "predictions") == 0
     submission = yaml.safe_load((scanned / "predictions" / "submission.yaml").read_text())
