@@ -50,7 +50,6 @@ from fpp_ml_bench.files import (
 )
 from fpp_ml_bench.loaders.published.importing import Source
 from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
-from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
 from fpp_ml_bench.loaders.storage.card import NAME, RIG_FILE, front_matter
 from fpp_ml_bench.loaders.storage.croissant import FILE as CROISSANT_FILE
 from fpp_ml_bench.loaders.storage.croissant import croissant
@@ -480,35 +479,13 @@ def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
 def card_head(dataset: DatasetFolder, licence: str) -> str:
     """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know
     configurations and files."""
-    from datasets import DatasetInfo, Features  # takes a second to import
-    from datasets.splits import SplitDict, SplitInfo
-
     files: dict[str, list[str]] = {split: [] for split in dataset.splits}
     for name, shard in data_shards(dataset).items():
         files[shard.split].append(
             name
         )  # by name, not by pattern: a stray file can never join the data
-    infos = []
-    for config in dataset.configs:
-        described = published_features(dataset, config)
-        levels = sum(
-            4 if name in DEPTHS else 1
-            for name in described
-            if name not in (*LABELS, *RANGE, PREVIEW)
-        )
-        row_bytes = dataset.size[0] * dataset.size[1] * levels
-        splits = [
-            SplitInfo(name, row_bytes * len(samples), len(samples))
-            for name, samples in dataset.splits.items()
-        ]
-        info = DatasetInfo(
-            features=Features.from_dict(described),
-            splits=SplitDict({split.name: split for split in splits}),
-            dataset_size=sum(split.num_bytes for split in splits),
-        )
-        infos.append({"config_name": config, **info._to_yaml_dict()})
     configs = card_configs(dataset, dataset.fingerprint, files, preview=True)
-    return front_matter(dataset.manifest, configs, licence, ["fpp-ml-bench"], dataset_info=infos)
+    return front_matter(dataset.manifest, configs, licence, ["fpp-ml-bench"])
 
 
 def stage_dataset(

@@ -114,10 +114,9 @@ def front_matter(
     configs: list[Any],
     licence: str | None = None,
     tags: Sequence[str] = (),
-    **more: Any,
 ) -> str:
     """Front matter of a card: from it Hugging Face tools know configurations and files. ``licence``
-    is by default `default_licence`; ``more`` are other keys."""
+    is by default `default_licence`."""
     rows = sum(map(len, manifest.samples.values()))
     head = {
         "license": licence or default_licence(manifest),
@@ -128,7 +127,6 @@ def front_matter(
         ],
         "tags": ["fringe-projection-profilometry", "structured-light", "metrology", *tags],
         "configs": configs,
-        **more,
     }
     return f"---\n{yaml_text(head)}---\n"
 

@@ -226,12 +226,10 @@ def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, 
     }
 
 
-def published_features(
-    dataset: DatasetFolder, config: str | None = None
-) -> dict[str, dict[str, Any]]:
-    """The `columns` of a configuration as published, as `sample.features`; frames and preview are
+def published_features(dataset: DatasetFolder) -> dict[str, dict[str, Any]]:
+    """The `columns` of the files as published, as `sample.features`; frames and preview are
     images."""
-    names = columns(dataset, config)
+    names = columns(dataset)
     pictures = {
         name: {"_type": "Image"} for name in names if name == PREVIEW or name.startswith("frame_")
     }

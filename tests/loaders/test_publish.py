@@ -6,10 +6,12 @@ import re
 import socket
 import subprocess
 import sys
+from io import BytesIO
 
 import cv2
 import mlcroissant
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from conftest import TINY_CONFIGS
@@ -171,27 +173,21 @@ def test_the_published_croissant_is_valid(published, client, dataset):
     assert first["depth"]["arrayShape"] == ",".join(map(str, SIZE))
 
 
-def test_the_card_describes_columns_and_splits(published, client, dataset):
+def test_the_card_names_columns_and_files_of_each_configuration(published, client, dataset):
     files = client.server.repos["datasets", "alice/fpp"].files
     head, body = files["README.md"].decode().split("---\n", 2)[1:]
-    for info in yaml.safe_load(head)["dataset_info"]:
-        names = config_columns(dataset.sequence, info["config_name"], exact=True)
-        assert {column["name"] for column in info["features"]} == {*names, "depth_preview"}
-        assert {split["name"]: split["num_examples"] for split in info["splits"]} == {
-            split: len(samples) for split, samples in dataset.splits.items()
-        }
-        features = Features._from_yaml_list(info["features"])
-        assert features["depth"] == Array2D(SIZE, "float32") and isinstance(
-            features[names[4]], Image
-        )
     height, width = SIZE
-    pixels = height * width * (1 + 4 + 4 + 1 + 1)  # frame 0, two depths, flags, cover
-    single = next(
-        info
-        for info in yaml.safe_load(head)["dataset_info"]
-        if info["config_name"] == "single_shot"
-    )
-    assert single["splits"][-1]["num_bytes"] == 2 * pixels
+    for config in yaml.safe_load(head)["configs"]:
+        names = config_columns(dataset.sequence, config["config_name"], exact=True)
+        assert set(config["columns"]) == {*names, "depth_preview"}
+        for split in config["data_files"]:
+            tables = [pq.ParquetFile(BytesIO(files[path])) for path in split["path"]]
+            assert sum(table.metadata.num_rows for table in tables) == len(
+                dataset.splits[split["split"]]
+            )
+            features = Features.from_arrow_schema(tables[0].schema_arrow)
+            assert features["depth"] == Array2D(SIZE, "float32")
+            assert isinstance(features[names[4]], Image)
     for name in ("sample", "depth", "depth_exact", "flags", "cover", "depth_min", "depth_preview"):
         assert f"| `{name}` |" in body
     assert "| `frame_00` ... `frame_51` | image, 8-bit grey | grey level |" in body
