@@ -148,19 +148,27 @@ def older_pictures() -> list[str]:
     return lines
 
 
+OTHERS = {"frames": "Frames", "time_ms": "Time, ms", "memory_mib": "Memory, MiB"}
+"""What a table may show of a row beside its scores."""
+
+
 def value_of(entry: Entry, key: str) -> float:
-    """A score of a row, its frames, or its run time in ms. KeyError for what it does not have."""
-    if key == "frames":
-        return float(entry.frames)
-    value = entry.latency_ms if key == "time_ms" else entry.value(key)
+    """A score of a row, or one of `OTHERS`. KeyError for what it does not have."""
+    timing = entry.row.submission.timing
+    others = {
+        "frames": float(entry.frames),
+        "time_ms": entry.latency_ms,
+        "memory_mib": timing.working_memory_mib if timing else None,
+    }
+    value = others[key] if key in others else entry.value(key)
     if value is None:
         raise KeyError(key)
     return 100 * value if key.endswith("_share") else value
 
 
 def title_of(key: str) -> str:
-    if key in ("frames", "time_ms"):
-        return {"frames": "Frames", "time_ms": "Time, ms"}[key]
+    if key in OTHERS:
+        return OTHERS[key]
     return f"{METRICS[key].title}, {'%' if key.endswith('_share') else 'mm'}"
 
 
