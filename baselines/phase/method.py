@@ -54,10 +54,6 @@ and 0.05, docs/results/frames.md). The margin of an order overestimates the prob
 wrong; these factors correct that."""
 
 
-LIT_BACKGROUND = Assumption(
-    "a lit background",
-    "Assumes a lit background; not one albedo, so that little tells the fringe order.",
-)
 ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
 KNOWN_RANGE = Assumption(
     "known range",
