@@ -6,7 +6,7 @@ With all steps and both directions it is the process that made the ``depth`` col
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import index
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -21,7 +21,6 @@ from fpp_ml_bench.decoding.fewest import fewest_plans, fewest_steps
 from fpp_ml_bench.decoding.triangulation import (
     ASSUMED_NOISE_GREY,
     STATED_SYSTEMATIC_RAD,
-    SYSTEMATIC_RAD,
     depth_sigma_mm,
     noise_by_light,
 )
@@ -162,28 +161,18 @@ class ClassicalMethod(Method):
     def answer(self, frames: Frames) -> Answer:
         """Depth, and its standard uncertainty by the noise of the frames, light of further bounces
         and the calibration; none for a code that has none by pixel."""
-        return self._measured(frames, self.rig, STATED_SYSTEMATIC_RAD)[0]
-
-    def measure(self, frames: Frames) -> tuple[Answer, NDArray[np.float32]]:
-        """`answer`, and the modulation in grey levels (H, W), the larger of both directions; 0
-        where there is none. The uncertainty is that of neighbours against each other, by which
-        networks compare them: without the calibration's error, which they share."""
-        return self._measured(frames, replace(self.rig, calibration_px=0.0), SYSTEMATIC_RAD)
-
-    def _measured(
-        self, frames: Frames, rig: Rig, systematic_rad: float
-    ) -> tuple[Answer, NDArray[np.float32]]:
         decoded = self.decode(frames, details=True)
+        if not all(isinstance(self.rig.code(way), PhaseShift) for way in decoded.details):
+            return Answer(decoded.depth_mm)
         measured = np.stack([measured.modulation for measured in decoded.details.values()]).max(
             axis=0
         )
         modulation = np.nan_to_num(measured).astype(np.float32)
-        if not all(isinstance(self.rig.code(way), PhaseShift) for way in decoded.details):
-            return Answer(decoded.depth_mm), modulation
         dark, per_grey = noise_by_light(frames, self.rig) or (ASSUMED_NOISE_GREY**2, 0.0)
         noise_grey = np.sqrt(dark + per_grey * modulation.astype(np.float64))
-        sigma_mm = depth_sigma_mm(decoded, rig, noise_grey, self.steps, systematic_rad)
-        return Answer(decoded.depth_mm, sigma_mm), modulation
+        systematic_rad = STATED_SYSTEMATIC_RAD
+        sigma_mm = depth_sigma_mm(decoded, self.rig, noise_grey, self.steps, systematic_rad)
+        return Answer(decoded.depth_mm, sigma_mm)
 
 
 def _steps_for(dataset: Photographed, depth_noise_mm: float, options: Mapping[str, Any]) -> int:

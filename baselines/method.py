@@ -156,7 +156,12 @@ class Method:
         """For images of ``rig``; ``options`` are the fields of `Options`, and become the settings
         of its submission. `PredictionError` for an option that it does not have."""
         self.rig, self.options = rig, self.checked_options(options)
-        self.settings = {**self.settings, **plain_settings(self.options)}
+        # A submission states a path as text.
+        given = {
+            key: str(value) if isinstance(value, Path) else value
+            for key, value in asdict(self.options).items()
+        }
+        self.settings = {**self.settings, **given}
 
     @classmethod
     def checked_options(cls, given: Mapping[str, Any]) -> Any:
@@ -269,8 +274,8 @@ class Method:
 
 
 def checked(answer: Answer, size: tuple[int, int], where: object) -> Answer:
-    """``answer`` if its maps are finite float32 of ``size`` (H, W), as `Method.answer` must give
-    them; else `PredictionError`, which begins with ``where``."""
+    """``answer`` if its maps are finite float32 of ``size`` (H, W), no sigma below 0, as
+    `Method.answer` must give them; else `PredictionError`, which begins with ``where``."""
     if not isinstance(answer, Answer):
         raise PredictionError(
             f"{where}: answer gave {type(answer).__name__}, expected Answer(depth)"
@@ -283,6 +288,8 @@ def checked(answer: Answer, size: tuple[int, int], where: object) -> Answer:
             raise PredictionError(
                 f"{where}: the method gave values that are not finite: a fault of the method"
             )
+    if answer.sigma_mm is not None and (answer.sigma_mm < 0).any():
+        raise PredictionError(f"{where}: the method gave a sigma below 0: a fault of the method")
     return answer
 
 
@@ -298,11 +305,3 @@ def training_split_of(
 def is_built_in(part: Callable[..., Any]) -> bool:
     """Whether a class of methods, or a function of one, comes with this package."""
     return part.__module__.startswith(f"{__package__}.")
-
-
-def plain_settings(options: Any) -> dict[str, Setting]:
-    """The values of an instance of `Method.Options` as a submission states them: a path as text."""
-    return {
-        key: str(value) if isinstance(value, Path) else value
-        for key, value in asdict(options).items()
-    }

@@ -185,7 +185,7 @@ def check_same_method(path: Path, about: Submission, method: Method, timed: bool
     for key, (in_file, measured) in pairs.items():
         if in_file != measured:
             raise SubmissionError(
-                f"{printable(str(path), 500)}: {key} is {printable(str(in_file))}, but "
+                f"{printable(path)}: {key} is {printable(str(in_file))}, but "
                 f"{printable(str(measured))} for "
                 "the method to measure; what is measured belongs to the very method that was "
                 "scored: give the same "
@@ -218,6 +218,6 @@ def _described(path: Path) -> tuple[Submission, Result | None]:
         return result.submission, result
     if path.name != SUBMISSION_FILE:
         raise SubmissionError(
-            f"{printable(str(path), 500)}: expected a {SUBMISSION_FILE} or a result file (*.json)"
+            f"{printable(path)}: expected a {SUBMISSION_FILE} or a result file (*.json)"
         )
     return read_submission(path.parent), None

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from fpp_ml_bench.errors import BuildError, FppBenchError, PredictionError
 
-NAME_LIMIT = 200
+NAME_LIMIT, PATH_LIMIT = 200, 500
 """Longest text a submission may hold in any one value, in characters."""
 DEEPEST, LONGEST_NUMBER, MOST_NODES, MOST_VALUES = 64, 1_000, 50_000, 1_000_000
 """Limits of a file from outside, checked before its values are built: levels of mappings and lists
@@ -65,7 +65,9 @@ def cause_of(error: Exception) -> str:
 
 def printable(value: object, limit: int = NAME_LIMIT) -> str:
     """``value`` as text that is safe in a terminal: control characters escaped, cut at ``limit``
-    characters."""
+    characters, a path at `PATH_LIMIT`."""
+    if isinstance(value, Path):
+        value, limit = str(value), PATH_LIMIT
     text = value if isinstance(value, str) else repr(value)
     escaped = "".join(
         c

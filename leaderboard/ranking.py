@@ -384,7 +384,7 @@ def expand(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         named = sorted(path.glob("*.json")) if path.is_dir() else [path]
         if not named:
-            shown = printable(str(path), 500)
+            shown = printable(path)
             raise SubmissionError(
                 f"{shown}: expected result files (*.json) in this folder, found none"
             )
@@ -392,9 +392,7 @@ def expand(paths: Iterable[Path]) -> list[Path]:
     seen: set[Path] = set()
     for path in files:
         if (whole := path.resolve()) in seen:
-            raise SubmissionError(
-                f"{printable(str(path), 500)} is given twice; name each result once"
-            )
+            raise SubmissionError(f"{printable(path)} is given twice; name each result once")
         seen.add(whole)
     return files
 
@@ -460,9 +458,9 @@ def _check_names(shown: Sequence[Ranked]) -> None:
             of_method = entry.row.submission.method == row.entry.row.submission.method
             if looks_like(entry.name, name) and not (entry.name == own and of_method):
                 raise SubmissionError(
-                    f"{printable(str(entry.path), 500)}: the name {printable(entry.name)!r} is "
+                    f"{printable(entry.path)}: the name {printable(entry.name)!r} is "
                     f"{printable(name)!r}, or "
-                    f"looks like it, which is that of {printable(str(row.entry.path), 500)}; give "
+                    f"looks like it, which is that of {printable(row.entry.path)}; give "
                     f"it another name"
                 )
 
@@ -517,7 +515,7 @@ def _methods(entries: Sequence[Entry]) -> list[tuple[Entry, Entry | None]]:
         by_name[key] = (by_name[key][0], entry) if key in by_name else (entry, None)
         first = by_data.setdefault(entry.is_unseen, entry)
         if _counts(first) != _counts(entry):
-            files = [printable(str(e.path), 500) for e in (entry, first)]
+            files = [printable(e.path) for e in (entry, first)]
             raise SubmissionError(
                 f"{files[0]}: its objects, samples or pixels are not those of {files[1]} on the "
                 f"same data; score the "
@@ -536,7 +534,7 @@ def _counts(entry: Entry) -> set[tuple[str, int, int, int]]:
 def _check_one_method(first: Entry, second: Entry) -> None:
     """Refuse (SubmissionError) two rows of one name that are not a method's on the two test
     sets."""
-    files = [printable(str(entry.path), 500) for entry in (first, second)]
+    files = [printable(entry.path) for entry in (first, second)]
     both = f"{files[0]} and {files[1]} both hold {printable(first.name)!r}"
     if first.name != second.name:
         both += f" or what looks like it, {printable(second.name)!r},"

@@ -7,7 +7,6 @@ import math
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator
-from functools import cache
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
@@ -78,6 +77,7 @@ _TWINS = (
 )
 """Small characters that look the same, or whose capitals do, behind the one that stands for all of
 them: out of Unicode's confusables (UTS 39), those of a Latin letter, figure or sign."""
+_TWIN_OF = {ord(twin): group[0] for group in _TWINS.split() for twin in group}
 
 
 class ObjectMeans(Headline, SparseModel):
@@ -371,14 +371,9 @@ def view_means(objects: Iterable[ObjectMeans], key: str) -> Iterator[tuple[str, 
 def name_key(name: str) -> str:
     """What two names share that look the same: compatible forms and twins of other scripts,
     ignoring diacritics, letter case, spaces, and dots at the ends."""
-    key = unicodedata.normalize("NFKD", name).casefold().translate(_twins())
+    key = unicodedata.normalize("NFKD", name).casefold().translate(_TWIN_OF)
     key = _DIACRITICS.sub("", key).replace("rn", "m").replace("vv", "w")
     return " ".join(key.split()).strip(". ")
-
-
-@cache
-def _twins() -> dict[int, str]:
-    return {ord(twin): group[0] for group in _TWINS.split() for twin in group}
 
 
 def looks_like(name: str, other: str) -> bool:
@@ -534,7 +529,7 @@ def check_size(data: bytes, path: Path) -> None:
     """Refuse (SubmissionError) a row file of more than `LARGEST_ROW_BYTES`."""
     if len(data) > LARGEST_ROW_BYTES:
         raise SubmissionError(
-            f"{printable(str(path), 500)}: the row has {len(data):,} bytes, expected at most "
+            f"{printable(path)}: the row has {len(data):,} bytes, expected at most "
             f"{LARGEST_ROW_BYTES:,}; "
             "shorten settings, software or seeds in submission.yaml, and score again"
         )

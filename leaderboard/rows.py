@@ -149,7 +149,7 @@ class Entry:
 def read_entry(path: Path) -> Entry:
     """Read a row file or a result file strictly. SubmissionError names the file and what is wrong
     with it, also for one of another protocol: its errors follow other rules."""
-    content, file = read_json(path), printable(str(path), 500)
+    content, file = read_json(path), printable(path)
     data = file_content(path, _LARGEST_FILE_BYTES, SubmissionError)
     is_row_file = isinstance(content, dict) and "row_schema_version" in content
     if not is_row_file:

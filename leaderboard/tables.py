@@ -49,7 +49,6 @@ PAIRS_FIRST_OUT = ("Objects", "p", "95% interval", "p, Holm")
 LAST_OUT = ("Frames", "s/sample", "x trivial", "Object MAE")
 """In a narrow terminal, the columns of a ranking that are left out after all others of their width,
 in this order."""
-_PLAIN = frozenset(" -,+()/%=.")
 _FORMULA = re.compile(r"(?:^|[,;|\t\r\n])(?=[^\w=+@-]*[=+@-])")
 """Where a cell may begin, at the start of a text or behind what a spreadsheet may split it at, with
 a sign that begins a formula before any letter or digit: behind spaces, quotes, a byte order

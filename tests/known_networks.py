@@ -6,6 +6,7 @@ from torch import nn
 
 from fpp_ml_bench.baselines.diagnostics.scenes import truth
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+from fpp_ml_bench.baselines.method import Answer
 
 
 class Oracle(nn.Module):
@@ -32,7 +33,7 @@ def subject_with(network: nn.Module, size, layers=("out",)) -> Subject:
         image_size=size,
         frames_used=(0,),
         direction="horizontal",
-        predict_frames=lambda frames: np.zeros(size, np.float32),
+        answer=lambda frames: Answer(np.zeros(size, np.float32)),
         normalisation="individual",
         network=network,
         layer_names=layers,

@@ -194,7 +194,7 @@ def gauges(rig: Rig) -> Iterator[Gauge]:
     """All gauges in their positions, in metres in the rig's camera coordinates."""
     volume = Volume.of(rig)
     size = volume.diagonal_m
-    ball = _ball(DIAMETER * size / 2)
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=DIAMETER * size / 2)
     for number, corner in enumerate(CORNERS[:SPHERES]):
         yield _spheres("sphere", number, [volume.placed(ball.vertices, corner)], ball)
     for number, direction in enumerate(DIRECTIONS[:BARS]):
@@ -210,10 +210,6 @@ def gauges(rig: Rig) -> Iterator[Gauge]:
         yield _flat("step", number, volume, CORNERS[number], TILTS_DEG[0], _step(side / 2, height))
     for number in range(OTHERS):
         yield _flat("wedge", number, volume, CORNERS[number], TILTS_DEG[0], _wedge(side / 2))
-
-
-def _ball(radius_m: float) -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(subdivisions=5, radius=radius_m)
 
 
 def _spheres(kind: Kind, number: int, centres_m: list[Vector], ball: trimesh.Trimesh) -> Gauge:

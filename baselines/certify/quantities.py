@@ -66,6 +66,14 @@ QUANTITIES: dict[str, Quantity] = {
 }
 """By symbol. Form after VDI/VDE 2634 part 2, whose text was not read: a range over all but
 `REJECTED` of the points."""
+SYMBOLS = {
+    "sphere": ("PF", "PF95", "PS"),
+    "ball bar": ("SD",),
+    "plane": ("F", "F95"),
+    "step": ("H", "E"),
+    "wedge": ("W",),
+}
+"""What is measured of each kind of gauge."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +208,7 @@ def measure(
     of_parts = [points[where & answered] for where in inner]
     residual = np.where(asked & answered, depth_mm - exact_mm, np.nan).astype(np.float32)
     enough = all(len(one) >= FEWEST_POINTS for one in of_parts)
-    values: dict[str, float | None] = dict.fromkeys(_symbols(gauge))
+    values: dict[str, float | None] = dict.fromkeys(SYMBOLS[gauge.kind])
     if enough:
         values |= _values(gauge, of_parts, unit_mm)
         if gauge.kind == "step":
@@ -208,16 +216,6 @@ def measure(
     count = int(asked.sum())
     refused = float(1 - (asked & answered).sum() / count) if count else 1.0
     return Measured(values, count, refused, residual)
-
-
-def _symbols(gauge: Gauge) -> tuple[str, ...]:
-    return {
-        "sphere": ("PF", "PF95", "PS"),
-        "ball bar": ("SD",),
-        "plane": ("F", "F95"),
-        "step": ("H", "E"),
-        "wedge": ("W",),
-    }[gauge.kind]
 
 
 def _values(gauge: Gauge, points: Sequence[Points], unit_mm: float) -> dict[str, float]:

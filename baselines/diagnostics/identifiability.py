@@ -26,7 +26,14 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     table_of,
 )
 from fpp_ml_bench.baselines.phase.candidates import irradiance
-from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer, Carriers, Crop, wrapped
+from fpp_ml_bench.baselines.phase.geometry import (
+    TAU,
+    CalibrationLayer,
+    Carriers,
+    Crop,
+    main_carrier,
+    wrapped,
+)
 from fpp_ml_bench.baselines.phase.local_fit import phase_slopes
 from fpp_ml_bench.depth import object_box
 from fpp_ml_bench.errors import DiagnosisError
@@ -97,25 +104,18 @@ def _of_one(rig: Rig, fringes: str, box: Crop, true_mm: Depths) -> Alike:
     near, far = rig.working_range_mm
     by_phase = (depths >= near) & (depths <= far)
     by_phase[0] = inside
-    true = _first(by_phase)
+    apart[0] = 0  # the true one, also where its light is not known
     fits = {
-        f"phase and {words}": by_phase & ((apart <= np.log1p(share)) | true)
+        f"phase and {words}": by_phase & (apart <= np.log1p(share))
         for words, share in KNOWN_ALBEDO.items()
     }
     return Alike(box, np.where(by_phase, depths, np.nan), {"phase": by_phase, **fits})
 
 
-def _first(maps: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """True for the first candidate alone."""
-    first = np.zeros_like(maps)
-    first[0] = True
-    return first
-
-
 def _of_two(carriers: Carriers, box: Crop, true_mm: Depths, range_mm: tuple[float, float]) -> Alike:
     """Where the pair of phases comes near to itself again, by the carrier with the larger gain."""
     gain = carriers.gain.astype(np.float64)
-    main = int(np.median(np.abs(gain[1])) > np.median(np.abs(gain[0])))
+    main = main_carrier(gain)
     q = carriers.nearness(true_mm)
     far_q, near_q = (carriers.nearness(end) for end in reversed(range_mm))
     most = int(np.ceil(float(np.nanmax(np.abs(gain[main] * (near_q - far_q)))) / TAU))
@@ -135,10 +135,10 @@ def _of_two(carriers: Carriers, box: Crop, true_mm: Depths, range_mm: tuple[floa
             f"phases to {rad:g} rad, {words}": in_range & (misfit_rad <= rad)
             for words, rad in reversed(SAME_RAD.items())
         }
-    stack[0] = true_mm
+    stack[0], in_range[0] = true_mm, True
     for each in fits.values():
         each[0] = np.isfinite(true_mm)
-    return Alike(box, np.where(in_range | _first(in_range), stack, np.nan), fits)
+    return Alike(box, np.where(in_range, stack, np.nan), fits)
 
 
 def shares(found: Alike, answer_mm: NDArray[np.float32] | None) -> dict[str, float]:
@@ -191,9 +191,10 @@ class Identifiability(Probe):
                 bound = alike(rig, code, depth_mm)
                 found[code].append(shares(bound, answer if code == own else None))
                 if number == 0:
-                    maps |= {
-                        f"{code},\n{kind}": _picture(fits) for kind, fits in bound.fits.items()
-                    }
+                    for kind, fits in bound.fits.items():
+                        depths = np.where(fits[0], fits.sum(axis=0, dtype=np.float64), np.nan)
+                        picture = Picture(depths, "viridis", 1.0, float(SHOWN))
+                        maps[f"{code},\n{kind}"] = picture
             dataset.release(sample)
         rows = {
             code: {key: float(np.mean([row[key] for row in each])) for key in each[0]}
@@ -222,12 +223,6 @@ class Identifiability(Probe):
             return None
         frame = dataset.sequence.frames[subject.frames_used[0]]
         return "crossed" if frame.kind == "crossed" else frame.direction
-
-
-def _picture(fits: NDArray[np.bool_]) -> Picture:
-    """Number of depths, NaN outside the object."""
-    count = fits.sum(axis=0).astype(np.float64)
-    return Picture(np.where(fits[0], count, np.nan), "viridis", 1.0, float(SHOWN))
 
 
 def _summary(subject: "Subject", own: str | None, rows: dict[str, dict[str, float]]) -> str:

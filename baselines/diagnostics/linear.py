@@ -18,7 +18,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -100,7 +99,6 @@ FRINGE = ("phase", "order")
 SPATIAL: Targets = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
 """Of the four-convolution probes, which are trained on the maps of the whole image."""
 
-Image = NDArray[np.float32]
 Networks = Mapping[tuple[str, int], nn.Module]
 """By `TRAINED` or `UNTRAINED`, and the seed of the weights."""
 Source = tuple[str, int, str]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.diagnostics.probe import spread
-from fpp_ml_bench.baselines.method import Answer, Frames, Method
+from fpp_ml_bench.baselines.method import Answer, Frames, Method, checked
 from fpp_ml_bench.baselines.networks.model import build, fringe_batch
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.registry import FILE_MARK, code_in, find, load_from_file, load_method
@@ -68,7 +68,7 @@ class Subject:
     image_size: tuple[int, int]
     frames_used: tuple[int, ...]
     direction: Direction | Literal["both"]
-    predict_frames: Callable[[Frames], Depth]
+    answer: Callable[[Frames], Answer]
     uses_ground_truth_mask: bool = False
     normalisation: Normalisation | None = None
     network: nn.Module | None = None
@@ -93,16 +93,8 @@ class Subject:
         return captured_frames(dataset, self, sample)  # type: ignore[arg-type]  # it has what this asks a method for
 
     def predict(self, frames: Frames) -> Depth:
-        """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape
-        or not finite."""
-        depth: Any = np.asarray(self.predict_frames(frames))
-        if depth.shape == self.image_size:
-            depth = torch.from_numpy(depth.astype(np.float32))
-        return checked_output(depth, self.image_size, self.name).numpy()
-
-    def answer(self, frames: Frames) -> Answer:
-        """`predict`, in the form of `Method.answer`."""
-        return Answer(self.predict(frames))
+        """Depth float32 (H, W) in ``units``, `checked`."""
+        return checked(self.answer(frames), self.image_size, self.name).depth
 
     @property
     def answers_normalised(self) -> bool:
@@ -156,20 +148,6 @@ def background_below(normalised: bool, near_mm: float) -> float:
     """Predictions below it, normalised or in mm, are nearer to background than to any object, of
     which none is nearer than ``near_mm``."""
     return NORMALISED_BACKGROUND if normalised else near_mm / 2
-
-
-def network_output(network: nn.Module, batch: Tensor, name: str) -> Depth:
-    """What ``network`` makes of the first image of ``batch``, float32 (H, W). Raises
-    `DiagnosisError` for a network that fails, and as `checked_output`."""
-    try:
-        with torch.inference_mode():
-            output = network(batch)
-    except Exception as error:  # the user's code can raise anything
-        reason = f"{type(error).__name__}: {printable(str(error), 400)}"
-        raise DiagnosisError(
-            f"{name}: on fringes of shape {tuple(batch.shape)} it failed: {reason}"
-        ) from error
-    return checked_output(output, batch.shape, name)[0, 0].numpy()
 
 
 def checked_output(output: Tensor, shape: Sequence[int], name: str) -> Tensor:
@@ -286,7 +264,7 @@ def subject_of_method(method: Method, dataset: DatasetFolder, **network: Any) ->
         sha256=hashlib.sha256(identity.encode()).hexdigest(),
         image_size=dataset.size,
         direction=_direction_of(dataset, method.frames_used),
-        predict_frames=lambda frames: method.answer(frames).depth,
+        answer=method.answer,
         **network,
     )
 
@@ -344,9 +322,18 @@ def _subject_of_factory(
             values = value.detach().cpu().contiguous().flatten().view(torch.uint8)
             digest.update(key.encode() + values.numpy().tobytes())
 
-    def predict(frames: Frames) -> Depth:
-        output = network_output(network, user_subject.input_batch([frames]), path.stem)
-        return denormalise(output, normalisation, 0.0, 1.0).astype(np.float32)
+    def answer(frames: Frames) -> Answer:
+        batch = user_subject.input_batch([frames])
+        try:
+            with torch.inference_mode():
+                output = network(batch)
+        except Exception as error:  # the user's code can raise anything
+            reason = f"{type(error).__name__}: {printable(str(error), 400)}"
+            raise DiagnosisError(
+                f"{path.stem}: on fringes of shape {tuple(batch.shape)} it failed: {reason}"
+            ) from error
+        depth = checked_output(output, batch.shape, path.stem)[0, 0].numpy()
+        return Answer(denormalise(depth, normalisation, 0.0, 1.0).astype(np.float32))
 
     user_subject = Subject(
         name=path.stem,
@@ -356,7 +343,7 @@ def _subject_of_factory(
         image_size=dataset.size,
         frames_used=(frame,),
         direction=_direction_of(dataset, (frame,)),
-        predict_frames=predict,
+        answer=answer,
         normalisation=normalisation,
         network=network,
         layer_names=_select_layers(layers, network, name),

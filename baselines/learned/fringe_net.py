@@ -130,22 +130,11 @@ def phases_of(networks: Sequence[FringeNet], x: Image) -> tuple[Phases, Image]:
 
 @dataclass(frozen=True)
 class Fringes:
-    """Networks for the carriers of a rig. ``signs`` (K,): 1 where a phase grows with nearness;
-    ``warp``: from the image to one that the networks know."""
+    """Networks for the carriers of a rig, and the ``warp`` from its image to one that the networks
+    know."""
 
-    signs: NDArray[np.float64]
     networks: Sequence[FringeNet]
     warp: Warp
-
-    @classmethod
-    def of(
-        cls,
-        step_rad: NDArray[np.float64],
-        signs: NDArray[np.float64],
-        networks: Sequence[FringeNet],
-    ) -> "Fringes":
-        """``step_rad`` (K, 2): change of the carriers' phases per px along x and y."""
-        return cls(signs, networks, Warp.of(step_rad, signs))
 
     def answer(self, seen: Capture, grey: Image) -> tuple[Phases, Mask]:
         """Phases of the K carriers of ``grey`` (h, w), which was observed as ``seen``, and the
@@ -157,7 +146,7 @@ class Fringes:
             image, misfit = warp.image(grey), warp.image(misfit)
         scene = FringeScene.of(image, warp.period_px)
         phases, logit = phases_of(self.networks, channels(scene, misfit, background.shown))
-        places = list(PLACES[len(self.signs)])
+        places = list(PLACES[len(warp.signs)])
         phase_rad, sigma_rad = phases.phase_rad[places], phases.sigma_rad[places]
         if warp.needed:
             phase_rad, logit, *sigmas = warp.back(phase_rad, [logit, *sigma_rad], grey.shape)
@@ -250,5 +239,4 @@ def _nearness_fit(seen: CrossedObservation, fit: NearnessFit, sigma_rad: Image) 
         seen.light - np.maximum(fit.brightness, 0) * fringes(carriers, nearness, seen.contrast)[0]
     )
     uncertainty = np.hypot(*(carriers.gain * sigma_rad)) / carriers.joint_gain
-    maps = (nearness, fit.brightness, misfit, fit.weight, uncertainty)
-    return NearnessFit(*(np.asarray(values, np.float32) for values in maps))
+    return NearnessFit.of(nearness, fit.brightness, misfit, fit.weight, uncertainty)

@@ -26,7 +26,7 @@ from fpp_ml_bench.baselines.learned.scenes import (
     photographed,
     with_unions,
 )
-from fpp_ml_bench.baselines.learned.warp import signs_of
+from fpp_ml_bench.baselines.learned.warp import signs_of, steps_and_signs
 from fpp_ml_bench.baselines.phase.empty_scene import Background, CrossedEmptyScene, EmptyScene
 from fpp_ml_bench.baselines.phase.geometry import (
     CalibrationLayer,
@@ -40,7 +40,7 @@ from fpp_ml_bench.baselines.phase.geometry import (
 from fpp_ml_bench.baselines.phase.local_fit import Demodulator
 from fpp_ml_bench.baselines.training.engine import Display
 from fpp_ml_bench.coding.phase_shift import wrapped_phase
-from fpp_ml_bench.constants import MM_PER_M, OBJECTS, VIEWS, split_of
+from fpp_ml_bench.constants import OBJECTS, VIEWS, split_of
 from fpp_ml_bench.depth import depth_edges
 from fpp_ml_bench.design.rigs import drawn_rig
 from fpp_ml_bench.errors import TrainingError
@@ -302,7 +302,7 @@ class _Crossed(_Kind):
             raise TrainingError("expected a rig with crossed frames")
         self.carriers = carriers = Carriers.of(rig, rig.crossed)
         self.period_px, self.step_rad = carriers.period_px, carriers.step_rad
-        self.signs = signs_of(carriers)
+        self.signs = signs_of(carriers.gain)
         stride = stride_of(self.period_px)
         self._demodulator = Demodulator(carriers, stride)
         self._scene = CrossedEmptyScene(carriers, stride)
@@ -321,9 +321,7 @@ class _Line(_Kind):
         self.layer = CalibrationLayer.of(rig, way)
         self.period_px = rig.image_px_per_period(way)
         self._scene = EmptyScene(rig, self.layer, self.period_px, None, None)
-        carrier = self.layer.absolute_phase(rig.standoff_m * MM_PER_M)
-        self.step_rad = np.array([[np.diff(carrier, axis=axis).mean() for axis in (1, 0)]])
-        self.signs = np.array([1.0 if float(np.median(self.layer.gain)) > 0 else -1.0])
+        self.step_rad, self.signs = steps_and_signs(rig, self.layer)
 
     def background(self, grey: NDArray[np.uint8]) -> Background:
         return self._scene.fit(grey)

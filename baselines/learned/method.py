@@ -27,7 +27,6 @@ from fpp_ml_bench.baselines.phase.method import (
 from fpp_ml_bench.baselines.phase.observe import OneCarrier, TwoCarriers
 from fpp_ml_bench.baselines.phase.route import one_carrier, two_carriers
 from fpp_ml_bench.baselines.phase.settings import MIN_CONFIDENCE, Settings
-from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig import Rig
@@ -88,7 +87,7 @@ class FringeNetTraining:
     )
 
 
-class FringeNetMethod(RouteMethod[Measurement]):
+class FringeNetMethod(RouteMethod[Any]):
     """Depth from one frame whose wrapped phases and object networks give (`fringe_net`); order and
     depth as of `phase` or `crossed`. ``members`` of the shipped ensemble, or the network in
     ``weights`` alone. The first sinusoid of a direction, or a crossed frame: ``fringes``. Raises
@@ -149,7 +148,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.learned.fringe_net import Fringes, LinePart, PairPart
         from fpp_ml_bench.baselines.learned.network import SHIPPED, load_net
-        from fpp_ml_bench.baselines.learned.warp import signs_of
+        from fpp_ml_bench.baselines.learned.warp import Warp, signs_of, steps_and_signs
         from fpp_ml_bench.baselines.training.weights import WeightsFile, shipped_names
 
         given = self.checked_options(options)
@@ -182,16 +181,13 @@ class FringeNetMethod(RouteMethod[Measurement]):
             self.frames_used = frames_of(rig, f"{self.name} --fringes crossed")
             pair = TwoCarriers(rig, own)
             carriers = pair.carriers
-            both = Fringes.of(carriers.step_rad, signs_of(carriers), networks)
+            both = Fringes(networks, Warp.of(carriers.step_rad, signs_of(carriers.gain)))
             self.route = route = two_carriers(pair, PairPart(both).before, PairPart.after)
             audited = self.use_audit(route, given.audit, given.anyway)
         else:
             other_pitch = pitch_setting(rig, way)
             model = OneCarrier(rig, Settings(way, min_confidence=given.min_confidence))
-            phase = model.layer.absolute_phase(model.rig.standoff_m * MM_PER_M)
-            step_rad = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)]])
-            sign = np.sign(np.median(model.layer.gain))
-            line = Fringes.of(step_rad, np.array([sign]), networks)
+            line = Fringes(networks, Warp.of(*steps_and_signs(model.rig, model.layer)))
             self.route = one_carrier(model, LinePart(line, model).before, LinePart.after)
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
             self.caution = model.caution

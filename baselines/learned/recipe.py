@@ -36,7 +36,7 @@ from fpp_ml_bench.baselines.learned.scenes import HELD_OUT
 from fpp_ml_bench.baselines.learned.warp import (
     PERIOD_RATIO,
     PLACES,
-    known_scale,
+    Warp,
     smoothed,
     to_known,
 )
@@ -222,15 +222,11 @@ def score(network: FringeNet, image: FringeImage) -> dict[str, float | None]:
     """Mean phase error in rad of an image's object beyond `EDGE_BAND_PX` from its silhouette,
     and nearer; whether it is within the stated standard uncertainty; object pixels missed and
     background pixels invented, in percent of the object's."""
-    matrix, signs = to_known(image.step_rad, image.signs)
-    matrix = matrix * known_scale(matrix)
-    height, width = image.grey.shape
-    corners = matrix @ [[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1]]
-    least = corners.min(axis=1)
-    across, down = np.ceil(corners.max(axis=1) - least).astype(int) + 1
-    window = _warped(image, matrix, signs, -least, (int(down), int(across)))
+    warp = Warp.of(image.step_rad, image.signs)
+    (across, down), move = warp.frame(image.grey.shape)
+    window = _warped(image, warp.matrix, warp.signs, move, (down, across))
     answer = network.outputs(window["x"])
-    places = list(PLACES[len(signs)])
+    places = list(PLACES[len(warp.signs)])
     phase = np.arctan2(answer[:3], answer[3:6])[places]
     truth = np.arctan2(window["truth"][:3], window["truth"][3:])[places]
     target = window["fitted"][places[0]]
@@ -243,7 +239,7 @@ def score(network: FringeNet, image: FringeImage) -> dict[str, float | None]:
     def mean(where: NDArray) -> float | None:
         return float(error[where].mean(dtype=np.float64)) if where.any() else None
 
-    kind = "crossed" if len(signs) == 2 else "line"
+    kind = "crossed" if len(warp.signs) == 2 else "line"
     return {
         f"{kind}_interior_rad": mean(inner),
         f"{kind}_edge_rad": mean(target & ~inner),

@@ -8,7 +8,7 @@ the rows k and S the signs. The phases come back less those of their carriers, a
 so that they are interpolated without their wraps.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.geometry import Carriers, Image, wrapped
-from fpp_ml_bench.constants import TAU
+from fpp_ml_bench.baselines.phase.geometry import CalibrationLayer, Carriers, Image, wrapped
+from fpp_ml_bench.constants import MM_PER_M, TAU
 from fpp_ml_bench.optics.named_rigs import CROSSED, DEFAULT_CROSSED, crossed_rig
+from fpp_ml_bench.optics.rig import Rig
 
 NEAR_SHARE = 0.02
 """Largest difference of the map from none at which the image stays as it is: within it a network
@@ -46,7 +47,7 @@ def known(carriers: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if carriers == 1:
         return np.array([[0.0, TAU / KNOWN_PX[1]]]), np.ones(1)
     pair = Carriers.of(crossed_rig(), CROSSED[DEFAULT_CROSSED])
-    return pair.step_rad, signs_of(pair)
+    return pair.step_rad, signs_of(pair.gain)
 
 
 def to_known(
@@ -100,7 +101,7 @@ class Warp:
 
     def image(self, grey: Image) -> Image:
         """The image float32 (h, w) as the network knows it; beyond its borders it is mirrored."""
-        size, move = self._frame(grey.shape)
+        size, move = self.frame(grey.shape)
         grey = smoothed(grey, self.matrix)
         affine = np.column_stack([self.matrix, move])
         return cv2.warpAffine(  # type: ignore[return-value]
@@ -110,7 +111,7 @@ class Warp:
     def back(self, phase_rad: Image, maps: Sequence[Image], shape: tuple[int, ...]) -> list[Image]:
         """Phases (K, h', w') of the network's image at the pixels of an image of ``shape`` (h, w),
         in [-pi, pi], and behind them other ``maps`` (h', w') of it, interpolated."""
-        _, (right, down) = self._frame(shape)
+        _, (right, down) = self.frame(shape)
         x, y = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
         (a, b), (c, d) = self.matrix
         across, along = a * x + b * y + right, c * x + d * y + down
@@ -131,7 +132,7 @@ class Warp:
             phases.append(wrapped(sign * (angle + carrier)).astype(np.float32))
         return [np.stack(phases), *map(taken, maps)]
 
-    def _frame(self, shape: tuple[int, ...]) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    def frame(self, shape: tuple[int, ...]) -> tuple[tuple[int, int], NDArray[np.float64]]:
         """Width and height of the network's image of one of ``shape`` (h, w), and what is added to
         ``T p`` for all of it to lie within."""
         height, width = shape
@@ -150,6 +151,16 @@ def smoothed(grey: Image, matrix: NDArray[np.float64]) -> Image:
     return cv2.GaussianBlur(grey, (0, 0), SHARPEST_PX * np.sqrt(1 / least**2 - 1))  # type: ignore[return-value]
 
 
-def signs_of(carriers: Carriers) -> NDArray[np.float64]:
-    """Whether each phase (K,) grows with nearness, 1, or falls, -1."""
-    return np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in carriers.gain])
+def signs_of(gains: Iterable[NDArray]) -> NDArray[np.float64]:
+    """Whether each phase (K,), whose change with nearness is one of ``gains`` (h, w), grows with
+    it, 1, or falls, -1."""
+    return np.array([1.0 if np.median(gain) > 0 else -1.0 for gain in gains])
+
+
+def steps_and_signs(
+    rig: Rig, layer: CalibrationLayer
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of fringes of one direction: change (1, 2) in rad of the phase per px along x and y at the
+    standoff, and its sign (1,) as of `signs_of`."""
+    phase = layer.absolute_phase(rig.standoff_m * MM_PER_M)
+    return np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)]]), signs_of([layer.gain])

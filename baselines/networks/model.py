@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from fpp_ml_bench.baselines.networks.base import FringeNetwork, checked_option, tiny_floats_are_zero
 from fpp_ml_bench.baselines.networks.hformer import Hformer
@@ -114,20 +114,6 @@ def _check_image(image: NDArray[Any], size: tuple[int, int], trained_on: str) ->
         )
 
 
-def represent(network: nn.Module, fringe: Tensor, name: str) -> Tensor:
-    """Output (B, 1, H, W) of ``network``; `PredictionError` where it holds a value that is not
-    finite."""
-    output: Tensor = network(fringe)
-    if not_finite := int((~output.isfinite()).sum()):
-        raise PredictionError(
-            f"{name}: the network gave {not_finite} of {output.numel()} values that are NaN or "
-            f"infinite; its weights "
-            "come from a training that diverged, or the precision it runs in is too low: train it "
-            "again"
-        )
-    return output
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
     """A network with its weights, in eval mode; ``sha256`` is that of the weights file."""
@@ -163,9 +149,17 @@ class Model:
     def predict_representation(self, fringes: Sequence[Fringe]) -> NDArray[np.float32]:
         """The network's own output float32 (B, H, W) for images (B, H, W), in the representation it
         was trained on (`fpp_ml_bench.depth`). Raises `PredictionError` as `predict`."""
-        batch = fringe_batch(fringes, self.config.image_size, self.config.name).to(self.device)
+        name = self.config.name
+        batch = fringe_batch(fringes, self.config.image_size, name).to(self.device)
         with torch.inference_mode(), tiny_floats_are_zero():
-            return represent(self.network, batch, self.config.name)[:, 0].float().cpu().numpy()
+            output = self.network(batch)
+        if not_finite := int((~output.isfinite()).sum()):
+            raise PredictionError(
+                f"{name}: the network gave {not_finite} of {output.numel()} values that are NaN or "
+                f"infinite; its weights come from a training that diverged, or the precision it "
+                f"runs in is too low: train it again"
+            )
+        return output[:, 0].float().cpu().numpy()  # type: ignore[no-any-return]
 
 
 def load(name_or_path: str | Path, device: str | None = None) -> Model:

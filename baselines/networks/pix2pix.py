@@ -185,7 +185,6 @@ class Discriminator(nn.Module):
 
     def __init__(self, *, width: int = 64, layers: int = 3, scales: int = 2) -> None:
         super().__init__()
-        self.options: dict[str, int | float] = {"width": width, "layers": layers, "scales": scales}
         self.scales = nn.ModuleList(_patch_discriminator(width, layers) for _ in range(scales))
         base.initialise(self, "gan")
 

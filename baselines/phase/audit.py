@@ -12,7 +12,7 @@ sizes are unknown: each group has a scale of its own, over which the Gaussian po
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase.depth import Fitted, Measurement
-from fpp_ml_bench.baselines.phase.geometry import Mask, wrapped
+from fpp_ml_bench.baselines.phase.geometry import Mask, main_carrier, wrapped
 from fpp_ml_bench.baselines.phase.object_mask import disk
 from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Frames
 from fpp_ml_bench.baselines.phase.route import CrossedRoute
@@ -107,18 +107,7 @@ class Audit:
         )
         if not self.fits:
             says = self.finding
-        return {
-            "audit": {
-                "points": self.points,
-                "across_px": list(self.across_px),
-                "chance_px": self.chance_px,
-                "noise_px": self.noise_px,
-                "roll_deg": list(self.roll_deg),
-                "zoom_percent": list(self.zoom_percent),
-                "along_px": self.along_px,
-                "says": says,
-            }
-        }
+        return {"audit": {**asdict(self), "says": says}}
 
 
 NOTHING = Audit(0, (0.0, 0.0), 0.0, 0.0, (0.0, 0.0), (0.0, 0.0), 0.0)
@@ -164,7 +153,7 @@ def _audited(fitted: Fitted) -> tuple[Audit, _Changes | None]:
     if not seen.inside.any():
         return NOTHING, None
     step = max(1, round(seen.period_px / POINTS_PER_PERIOD))
-    chance = fitted.wrong_chance
+    chance = fitted.order.wrong_chance
     sure = seen.inside & (chance <= max(SURE_CHANCE, float(np.median(chance[seen.inside]))))
     sure = cv2.erode(sure.astype(np.uint8), disk(step)) > 0
     used = np.zeros_like(sure)
@@ -225,7 +214,7 @@ def _chance_px(seen: CrossedObservation, used: Mask, ahead: NDArray[np.float64])
     P), in the best order of phases that are drawn at random."""
     carriers = seen.carriers
     gain, ends = carriers.gain[:, used], [carriers.nearness(end)[used] for end in seen.range_mm]
-    main = int(np.median(np.abs(gain[1])) > np.median(np.abs(gain[0])))
+    main = main_carrier(gain)
     span = np.median(np.abs(gain[main] * (ends[0] - ends[1]))) / TAU
     turns = np.arange(max(1, round(float(span))))[:, None]
     drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, gain.shape[1])

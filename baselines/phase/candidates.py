@@ -19,6 +19,7 @@ from fpp_ml_bench.baselines.phase.geometry import (
     Image,
     Mask,
     grid_of,
+    main_carrier,
     wrapped,
 )
 from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation
@@ -120,7 +121,7 @@ def crossed_candidates(seen: CrossedObservation) -> CrossedCandidates:
     orders, and it alone tells the nearness."""
     carriers, noise_grey = seen.carriers.at(grid_of(seen.stride)), seen.background.noise_grey
     gain, moved = carriers.gain, seen.moved
-    main = int(np.median(np.abs(gain[1])) > np.median(np.abs(gain[0]))) if moved is None else moved
+    main = main_carrier(gain) if moved is None else moved
     ends = [gain[main] * carriers.nearness(end) for end in seen.range_mm]
     low, high = np.minimum(*ends), np.maximum(*ends)
     residual = wrapped(seen.point_phase_rad - carriers.infinity_rad)

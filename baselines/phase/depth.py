@@ -47,7 +47,6 @@ from fpp_ml_bench.baselines.phase.observe import (
 from fpp_ml_bench.baselines.phase.order import (
     CrossedOrder,
     FringeOrder,
-    Turns,
     crossed_order,
     margin_by_range,
 )
@@ -83,15 +82,7 @@ window for the linear fit of the phase."""
 THIN_PERIODS = 0.5
 """Least width of an object, in periods, that is not THIN: a window next to a narrower part covers
 both of its sides."""
-EVIDENCE_SCALE = 1.0
-"""Difference of the evidence's cost by which the odds of two orders of crossed fringes grow e-fold.
-The costs are squared sigmas over 2, that is log-odds, so the scale is 1."""
-ENERGY_SCALE = 4.0
-"""Difference of the energy by which these odds grow e-fold. Larger than that of the evidence: the
-energy counts jumps to neighbours too, and not the pixel's evidence alone."""
-EVEN_ODDS = 0.8
-"""Sum of both scaled differences at which the two orders are equally likely. A larger number states
-more doubt at every pixel."""
+
 LEAST_WRONG = 0.01
 """Least chance of a wrong order for which the rival widens the uncertainty; below, it lies outside
 of the widest interval in use (99%). The variance of both orders would state several mm for a chance
@@ -191,30 +182,6 @@ class FringeMeasurement(Measurement):
     candidates: Orders
     expected_error_mm: Image
 
-    @classmethod
-    def of(
-        cls,
-        measured: Measurement,
-        wrapped_phase_rad: Image,
-        order: NDArray[np.int32],
-        candidates: Orders,
-        expected_error_mm: Image,
-    ) -> "FringeMeasurement":
-        """What every measurement states, and these."""
-        return cls(
-            measured.depth_mm,
-            measured.sigma_mm,
-            measured.order_doubt_mm,
-            measured.confidence,
-            measured.modulation_grey,
-            measured.reason,
-            measured.background_share,
-            wrapped_phase_rad,
-            order,
-            candidates,
-            expected_error_mm,
-        )
-
 
 @dataclass(frozen=True)
 class NearnessFit:
@@ -229,18 +196,19 @@ class NearnessFit:
     weight: Image
     uncertainty_rad: Image
 
+    @classmethod
+    def of(cls, *maps: NDArray) -> "NearnessFit":
+        """Of maps of any precision."""
+        return cls(*(np.asarray(values, np.float32) for values in maps))
+
 
 @dataclass(frozen=True)
 class Fitted:
-    """Crossed fringes with the ``fit`` of the nearness in an order. ``candidates``: that order and
-    the turns beside it; ``rival``: nearness (h, w) of the order that it might be instead;
-    ``wrong_chance`` (h, w): probability that it is; ``wall`` bool (h, w): pixels that count as
-    object although the wall explains them as well, or better."""
+    """Crossed fringes with the ``fit`` of the nearness in an ``order``. ``wall`` bool (h, w):
+    pixels that count as object although the wall explains them as well, or better."""
 
     seen: CrossedObservation
-    candidates: Turns
-    rival: Image
-    wrong_chance: Image
+    order: CrossedOrder
     fit: NearnessFit
     wall: Mask
 
@@ -310,8 +278,7 @@ def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
     )
     acting = SYSTEMATIC_SHARE + RIM_SHARE * (1 - np.minimum(share, 1))
     uncertainty = np.sqrt((averaged + rest * acting) / curvature) / bright
-    maps = (nearness, brightness, misfit, share, uncertainty)
-    return NearnessFit(*(np.asarray(values, np.float32) for values in maps))
+    return NearnessFit.of(nearness, brightness, misfit, share, uncertainty)
 
 
 def _of_best_sides(seen: CrossedObservation, fit: NearnessFit) -> NearnessFit:
@@ -325,8 +292,8 @@ def _of_best_sides(seen: CrossedObservation, fit: NearnessFit) -> NearnessFit:
     nearness, brightness, places = best_sides(
         fitted, seen.light, seen.inside, raised, noise_grey, seen.period_px
     )
-    misfit = np.asarray(seen.light - brightness * raised(nearness), np.float32)
-    return NearnessFit(
+    misfit = seen.light - brightness * raised(nearness)
+    return NearnessFit.of(
         nearness, brightness, misfit, fit.weight[*places], fit.uncertainty_rad[*places]
     )
 
@@ -351,8 +318,7 @@ def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessF
         / np.abs(gain)
     )
     weight = GaussianWindow(WINDOW_PERIODS * seen.period_px).moment(seen.inside.astype(np.float32))
-    maps = (nearness, brightness, misfit, weight, uncertainty)
-    return NearnessFit(*(np.asarray(values, np.float32) for values in maps))
+    return NearnessFit.of(nearness, brightness, misfit, weight, uncertainty)
 
 
 def reaching(apart_rad: NDArray, wrong_chance: Image) -> NDArray:
@@ -461,8 +427,8 @@ def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMe
     phase = (absolute - TAU * order).astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth_mm = layer.depth_of_residual_mm(phases)
-    return FringeMeasurement.of(
-        _restored(model, measured, inside, depth_mm, on_object, nearest),
+    return FringeMeasurement(
+        **vars(_restored(model, measured, inside, depth_mm, on_object, nearest)),
         wrapped_phase_rad=phase,
         order=np.nan_to_num(order).astype(np.int32),
         candidates=layer.orders_in_range(phase, model.range_mm),
@@ -483,13 +449,12 @@ def _restored_crossed(model: TwoCarriers, measured: Measurement) -> Measurement:
 
 def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
     """The measurement that follows from an order of every pixel, however it was chosen. A pixel
-    whose order is a guess has no depth: one of less than the least margin, and always a tie in
-    light that nothing calibrates."""
+    whose order is a guess has no depth: a tie in light that nothing calibrates."""
     seen, order, margin = chosen.seen, chosen.order, chosen.margin
-    guessed = margin < chosen.least_margin
+    guessed: Mask | bool = False
     if not seen.background.calibrated:  # no evidence about the order, whatever the choice preferred
         margin = margin_by_range(seen, order)
-        guessed = (margin == 0) | (margin < chosen.least_margin)
+        guessed = margin == 0
     inside, layer = seen.inside, seen.layer
     depth_mm = np.where(inside, layer.depth_mm(seen.phase_rad, order), 0.0)
     depth_mm[~seen.rig.in_range(depth_mm)] = 0.0
@@ -516,13 +481,14 @@ def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
     first, count = (
         _pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count)
     )
-    measured = FringeMeasurement.of(
-        replace(
-            judged,
-            sigma_mm=judged.sigma_mm
-            * np.float32(np.sqrt(np.pi / 2)),  # of a normal error of that expected size
-            order_doubt_mm=_pasted(seen, mm_per_rad * TAU * wrong_chance),
-        ),
+    judged = replace(
+        judged,
+        sigma_mm=judged.sigma_mm
+        * np.float32(np.sqrt(np.pi / 2)),  # of a normal error of that expected size
+        order_doubt_mm=_pasted(seen, mm_per_rad * TAU * wrong_chance),
+    )
+    measured = FringeMeasurement(
+        **vars(judged),
         wrapped_phase_rad=_pasted(seen, seen.phase_rad, np.float32, np.nan),
         order=_pasted(seen, order, np.int32),
         candidates=Orders(first, count),
@@ -545,32 +511,24 @@ def crossed_nearness(
 ) -> Fitted:
     """The order of every pixel, and the nearness that follows from it and the frame."""
     order = crossed_order(settings, seen, offered)
-    nearness = order.candidates.nearness[1]
     if seen.moved is None:
-        fit = _window_fit(seen, nearness)
+        fit = _window_fit(seen, order.nearness)
         if seen.sigma_rad is None:  # phases of networks have edges of their own
             fit = _of_best_sides(seen, fit)
     else:
-        fit = _own_fit(seen, nearness, seen.moved)
+        fit = _own_fit(seen, order.nearness, seen.moved)
     wall = np.zeros_like(seen.inside)
     if seen.moved is None and not seen.given:
         dropped, wall = gaps(seen.inside, seen.background, fit.misfit_grey)
         if not seen.background.shown:
             dropped = fit.brightness <= MIN_MODULATION
         seen = replace(seen, inside=seen.inside & ~dropped)
-    return Fitted(seen, order.candidates, order.rival, chance_of_wrong(order), fit, wall)
-
-
-def chance_of_wrong(order: CrossedOrder) -> Image:
-    """Probability of a wrong order, float32 (h, w), from evidence and margin."""
-    odds = order.evidence / EVIDENCE_SCALE + order.margin / ENERGY_SCALE - EVEN_ODDS
-    chance: Image = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
-    return chance
+    return Fitted(seen, order, fit, wall)
 
 
 def crossed_depth(model: TwoCarriers, fitted: Fitted) -> Measurement:
     """The measurement that follows from a fit."""
-    seen, fit, carriers = fitted.seen, fitted.fit, fitted.seen.carriers
+    seen, order, fit, carriers = fitted.seen, fitted.order, fitted.fit, fitted.seen.carriers
     depth_mm = carriers.depth_mm(fit.nearness)
     # A fit may leave the range that its order was chosen in.
     depth_mm = np.where(seen.inside & seen.rig.in_range(depth_mm), depth_mm, 0.0)
@@ -578,9 +536,9 @@ def crossed_depth(model: TwoCarriers, fitted: Fitted) -> Measurement:
     pairs = zip(seen.modulation, carriers.family.weights, strict=True)
     weakest = np.minimum(*(modulation / (weight * bright) for modulation, weight in pairs))
     lost = weakest < LOST_SHARE * max(seen.contrast) / max(carriers.family.weights)
-    wrong_chance = np.where(lost, np.maximum(fitted.wrong_chance, LOST_CHANCE), fitted.wrong_chance)
+    wrong_chance = np.where(lost, np.maximum(order.wrong_chance, LOST_CHANCE), order.wrong_chance)
     mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
-    doubt_rad = reaching(np.abs(fitted.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
+    doubt_rad = reaching(np.abs(order.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
     sigma_mm = mm_per_rad * np.hypot(fit.uncertainty_rad, doubt_rad)
     if seen.rig.background_m is not None:
         behind_mm = seen.rig.background_m * MM_PER_M - depth_mm
@@ -589,9 +547,7 @@ def crossed_depth(model: TwoCarriers, fitted: Fitted) -> Measurement:
     misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(
         fit.weight, 1e-3
     )
-    texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (
-        fitted.candidates.misfit_rad[1] > TEXTURE_RAD
-    )
+    texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (order.misfit_rad > TEXTURE_RAD)
     reasons = {
         Reason.ONE_DIRECTION: lost,
         Reason.TEXTURE: texture,

@@ -13,10 +13,10 @@ Z: without lens distortion every projector coordinate is affine in it, so that c
 working range; `Carriers.depth_mm` corrects it.
 
 Windows, steps of the grid of orders and filters of a network have a size in pixels of the fringe.
-So an image whose fringe period is far from the one that a method was made for is resampled, and
-what is measured is sampled back (`Resampling`): one with a period of 116 px is measured at 22.6 px,
-and a network that learnt from 22.6 px gets an image of 6 px enlarged. A longer period loses
-nothing: a local fit averages over a quarter of it anyway, and the image is shrunk by averaging.
+So an image whose fringe period is far longer than the one that the route was made for is shrunk, and
+what is measured is sampled back (`Resampling`): one with a period of 116 px is measured at 22.6 px.
+A longer period loses nothing: a local fit averages over a quarter of it anyway, and the image is
+shrunk by averaging.
 """
 
 from collections.abc import Callable, Iterable
@@ -49,6 +49,12 @@ RESAMPLED_JUMP_RAD = 1.0
 interpolated."""
 CLIPPED_SHARE = 0.1
 """Of an averaged pixel: what makes it saturated."""
+BEST_PX = 22.56
+"""Image px a period at which the constants of the phase route were chosen."""
+LONGEST_PX = 1.4 * BEST_PX
+"""Longest period of an image that stays as it is; beyond it is resampled to `BEST_PX`. On two
+validation rigs of 32 and 36 px `crossed` has 2.66 per mille of answered pixels resampled, and 2.89
+in twice the time as they are; fringe-net has 1.14 and 1.13."""
 NODES_PER_PERIOD = 7.5
 """Grid points along a period on which orders are chosen: every third pixel at 960 px."""
 
@@ -336,6 +342,11 @@ def _phases(
     )
 
 
+def main_carrier(gain: NDArray) -> int:
+    """Which of two carriers, whose gains are (2, ...), changes more with depth."""
+    return int(np.median(np.abs(gain[1])) > np.median(np.abs(gain[0])))
+
+
 def stride_of(period_px: float) -> int:
     """Image px a step of the grid on which orders are chosen."""
     return max(1, round(period_px / NODES_PER_PERIOD))
@@ -363,19 +374,6 @@ def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 @dataclass(frozen=True)
-class Periods:
-    """Fringe periods in image px: from ``shortest`` to ``longest`` an image stays as it is; beyond
-    it is resampled to a period of ``best``. The defaults are those of the phase route, whose
-    constants were chosen at 22.56 px. On two validation rigs of 32 and 36 px `crossed` has 2.66 per
-    mille of answered pixels resampled, and 2.89 in twice the time as they are; fringe-net has 1.14
-    and 1.13."""
-
-    shortest: float = 0.0
-    best: float = 22.56
-    longest: float = 1.4 * 22.56
-
-
-@dataclass(frozen=True)
 class Resampling:
     """From the images of ``captured`` to those of ``rig``, the same rig with a camera of another
     size, and back; equal rigs where nothing is to be done."""
@@ -384,14 +382,13 @@ class Resampling:
     rig: Rig
 
     @classmethod
-    def of(cls, rig: Rig, seen_px: float, periods: Periods) -> "Resampling":
-        """What brings fringes of ``seen_px`` image px a period into ``periods``."""
+    def of(cls, rig: Rig, seen_px: float) -> "Resampling":
+        """What brings fringes of ``seen_px`` image px a period to `LONGEST_PX` and less."""
         camera = rig.camera
-        if periods.shortest <= seen_px <= periods.longest:
+        if seen_px <= LONGEST_PX:
             return cls(rig, rig)
         width, height = (
-            max(1, round(length * periods.best / seen_px))
-            for length in (camera.width, camera.height)
+            max(1, round(length * BEST_PX / seen_px)) for length in (camera.width, camera.height)
         )
         # Rounding to whole pixels makes the scales of width and height a little different.
         down = height / camera.height
@@ -413,8 +410,7 @@ class Resampling:
         if not self.needed:
             return grey
         size = self.rig.camera.width, self.rig.camera.height
-        if size[0] > grey.shape[1]:
-            return cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)  # type: ignore[return-value]
+
         clipped = cv2.resize(
             (grey == GREY_LEVELS).astype(np.float32), size, interpolation=cv2.INTER_AREA
         )

@@ -28,9 +28,9 @@ from fpp_ml_bench.baselines.phase.observe import (
 )
 from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
 from fpp_ml_bench.baselines.phase.route import (
-    AnyRoute,
     CrossedRoute,
     Measured,
+    Route,
     one_carrier,
     two_carriers,
 )
@@ -39,7 +39,6 @@ from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import decode_stack, grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import read_mask
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_PITCH_PX, PAPER_SEQUENCE, Direction
@@ -55,10 +54,6 @@ and 0.05, docs/results/frames.md). The margin of an order overestimates the prob
 wrong; these factors correct that."""
 
 
-LIT_BACKGROUND = Assumption(
-    "a lit background",
-    "Assumes a lit background; not one albedo, so that little tells the fringe order.",
-)
 ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
 KNOWN_RANGE = Assumption(
     "known range",
@@ -114,7 +109,7 @@ class RouteMethod(Method, Generic[Measured]):
     """A method that measures every map of a sample at once by its `route`, which it puts together
     when it is made."""
 
-    route: AnyRoute[Measured]
+    route: Route[Any, Any, Any, Any, Measured]
     mask: NDArray[np.bool_] | None = None
     audited: CrossedRoute | None = None
     """The route, where the calibration is to be audited."""
@@ -226,7 +221,7 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
         if not submission.name.startswith("Phase route, "):
             return None
         settings = submission.settings
-        direction = direction_of(submission)
+        direction = DIRECTIONS[DIRECTIONS.index(settings["direction"])]  # type: ignore[arg-type]
         if "error_mm" in settings:
             name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
         else:
@@ -282,11 +277,6 @@ def crossed_image(images: Sequence[NDArray]) -> NDArray[np.uint8]:
     """The crossed frame of the images of `frames_of`."""
     grey = [grey_levels(image) for image in images]
     return grey[0] if len(grey) == 1 else crossed_from_pair(grey[0], grey[1])
-
-
-def has_crossed_fringes(rig: Rig) -> bool:
-    """Whether `frames_of` finds a crossed frame."""
-    return bool(rig.sequence.crossed_frames) or rig.fringe_directions == DIRECTIONS
 
 
 def shifted_carrier(rig: Rig, name: str) -> int:
@@ -360,32 +350,21 @@ class CrossedMethod(RouteMethod[Measurement]):
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
-        if not has_crossed_fringes(rig):
+        crossed = len(rig.sequence.crossed_frames)
+        if not crossed and rig.fringe_directions != DIRECTIONS:
             return []
-        return (
-            [{}, {"frames": CROSSED_FRAMES}]
-            if len(rig.sequence.crossed_frames) >= CROSSED_FRAMES
-            else [{}]
-        )
+        return [{}, {"frames": CROSSED_FRAMES}] if crossed >= CROSSED_FRAMES else [{}]
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:
-        return crossed_name(submission, "Crossed fringes ")
+        if not submission.name.startswith("Crossed fringes "):
+            return None
+        count = len(submission.frames_used)
+        return f"Crossed, {count} frame{'s' * (count > 1)}" if count != 2 else "Crossed, mean of 2"
 
     def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         images = super().images(frames)
         return images if self.settings.get("frames") == CROSSED_FRAMES else [crossed_image(images)]
-
-
-def crossed_name(submission: "Submission", begins: str) -> str | None:
-    """A short name for a submission of crossed fringes whose name ``begins`` so; None for
-    another."""
-    if not submission.name.startswith(begins):
-        return None
-    frames = {1: "1 frame", 2: "mean of 2"}.get(
-        len(submission.frames_used), f"{len(submission.frames_used)} frames"
-    )
-    return f"{printable(submission.settings.get('weights', 'Crossed'))}, {frames}"
 
 
 def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
@@ -406,12 +385,6 @@ def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, An
             f"{code.title}; say how many frames instead"
         )
     return options
-
-
-def direction_of(submission: "Submission") -> str:
-    """The setting ``direction`` of a submission. Raises ValueError or KeyError for settings of no
-    fringe route."""
-    return DIRECTIONS[DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ other still, which is left in their mean, where the shifted one cancels.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,6 @@ from fpp_ml_bench.baselines.phase.geometry import (
     Image,
     Mask,
     Orders,
-    Periods,
     Resampling,
     nearest_inside,
     repeated,
@@ -225,21 +225,16 @@ def modulation_noise_grey(shifts_rad: Sequence[float], noise_grey: float) -> flo
 
 class MeasurementModel:
     """What a rig photographs, and how phase is measured in it. Images whose fringe period
-    ``seen_px`` is beyond ``periods`` are resampled: then ``rig`` is that of the resampled images,
-    which an observation is of; images and masks have the captured size. ``frames``: their number
-    and what they are."""
+    ``seen_px`` is too long are resampled: then ``rig`` is that of the resampled images, which an
+    observation is of; images and masks have the captured size. ``frames``: their number and what
+    they are."""
 
     def __init__(
-        self,
-        rig: Rig,
-        settings: Settings,
-        seen_px: float,
-        periods: Periods | None,
-        frames: tuple[int, str],
+        self, rig: Rig, settings: Settings, seen_px: float, frames: tuple[int, str]
     ) -> None:
         near, far = rig.working_range_mm
         self.settings, self.frames, self.slack_mm = settings, frames, SLACK_SHARE * (far - near)
-        self.resampling = Resampling.of(rig, seen_px, periods or Periods())
+        self.resampling = Resampling.of(rig, seen_px)
         self.rig = self.resampling.rig
 
     @property
@@ -281,9 +276,7 @@ class OneCarrier(MeasurementModel):
     """Fringes of one direction, ``settings.frames`` of them (`steps_of`). Phases are those of the
     first of them."""
 
-    def __init__(
-        self, rig: Rig, settings: Settings | None = None, periods: Periods | None = None
-    ) -> None:
+    def __init__(self, rig: Rig, settings: Settings | None = None) -> None:
         settings = settings or Settings()
         rig.check_sampling()
         shifts_rad = rig.shifts_rad(settings.direction)
@@ -291,9 +284,7 @@ class OneCarrier(MeasurementModel):
         self.first_rad = first = shifts_rad[self.steps[0]]
         self.shifts_rad = tuple(shifts_rad[step] - first for step in self.steps)
         frames = len(self.steps), f"fringes, those of steps {self.steps}"
-        super().__init__(
-            rig, settings, rig.image_px_per_period(settings.direction), periods, frames
-        )
+        super().__init__(rig, settings, rig.image_px_per_period(settings.direction), frames)
         rig = self.rig
         self.layer = CalibrationLayer.of(rig, settings.direction).shifted(first)
         (near, far), periods_in_range = (
@@ -385,9 +376,6 @@ class OneCarrier(MeasurementModel):
             inside, fit = self._local_fits(
                 greys, background, crop, inside & ~dark, dark, mask is not None
             )
-        phase = wrapped(fit.phase_rad).astype(np.float32)
-        residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
-        slopes = phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
         return Observation(
             rig=self.rig,
             period_px=self.period_px,
@@ -402,10 +390,8 @@ class OneCarrier(MeasurementModel):
             beyond=dark & self._scene.beyond[crop],
             layer=layer,
             shifts_rad=self.shifts_rad,
-            fit=fit,
-            phase_rad=phase,
-            slopes=slopes,
             mean_grey=mean_grey,
+            **self._told(layer, inside, fit),
         )
 
     def with_object(self, seen: Observation, inside: Mask) -> Observation:
@@ -414,10 +400,14 @@ class OneCarrier(MeasurementModel):
         _, fit = self._local_fits(
             seen.greys, seen.background, seen.crop, inside, np.zeros_like(inside), True
         )
+        return replace(seen, inside=inside, **self._told(seen.layer, inside, fit))
+
+    def _told(self, layer: CalibrationLayer, inside: Mask, fit: FringeFit) -> dict[str, Any]:
+        """A fit, and the phase and slopes that it tells, as fields of an `Observation`."""
         phase = wrapped(fit.phase_rad).astype(np.float32)
-        residual = wrapped(phase - seen.layer.infinity_rad).astype(np.float32)
+        residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
-        return replace(seen, inside=inside, fit=fit, phase_rad=phase, slopes=slopes)
+        return {"fit": fit, "phase_rad": phase, "slopes": slopes}
 
     def _local_fits(
         self,
@@ -479,14 +469,13 @@ class TwoCarriers(MeasurementModel):
         rig: Rig,
         settings: Settings | None = None,
         family: Crossed | None = None,
-        periods: Periods | None = None,
         moved: int | None = None,
     ) -> None:
         self.family = family or rig.crossed or Crossed.of_pair(rig)
         rig.check_sampling()
         seen_px = max(rig.image_px_of_carrier(cycles) for cycles in self.family.cycles_per_px)
         frames = (1, "crossed frame") if moved is None else (CROSSED_FRAMES, "crossed frames")
-        super().__init__(rig, settings or Settings(), seen_px, periods, frames)
+        super().__init__(rig, settings or Settings(), seen_px, frames)
         self.moved = moved
         self.carriers = Carriers.of(self.rig, self.family)
         self.period_px = self.carriers.period_px

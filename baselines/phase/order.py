@@ -30,7 +30,6 @@ from fpp_ml_bench.baselines.phase.object_mask import disk
 from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.errors import DecodeError
 
 LARGE = np.float32(1e4)
 """Cost of a candidate that does not exist: far above any sum of costs, and small enough to be added
@@ -92,6 +91,15 @@ MEDIAN_STEP = 0.005
 LEAST_BRIGHT = 1.0
 """Least brightness, in grey levels, that light is divided by: it keeps the share finite in the
 dark."""
+EVIDENCE_SCALE = 1.0
+"""Difference of the evidence's cost by which the odds of two orders of crossed fringes grow e-fold.
+The costs are squared sigmas over 2, that is log-odds, so the scale is 1."""
+ENERGY_SCALE = 4.0
+"""Difference of the energy by which these odds grow e-fold. Larger than that of the evidence: the
+energy counts jumps to neighbours too, and not the pixel's evidence alone."""
+EVEN_ODDS = 0.8
+"""Sum of both scaled differences at which the two orders are equally likely. A larger number states
+more doubt at every pixel."""
 EVIDENCE_WEIGHT = 2.0
 """One carrier's phase has no error: evidence tells twice as much of the order as in one frame."""
 STEEPEST_PERIODS = 1.2
@@ -238,23 +246,11 @@ def solved(offered: Candidates, cost: Image, smoothness: float) -> tuple[NDArray
 @dataclass(frozen=True)
 class FringeOrder:
     """Fringes of one direction with the ``order`` of every pixel, int32 (h, w), and its ``margin``,
-    float32 (h, w): how clearly it won, 0 for a tie, 1 or more for certain. A pixel of less than
-    ``least_margin`` gets no depth. Raises `DecodeError` for maps that are not of the observation's
-    crop."""
+    float32 (h, w): how clearly it won, 0 for a tie, 1 or more for certain."""
 
     seen: Observation
     order: NDArray[np.int32]
     margin: Image
-    least_margin: float = -np.inf
-
-    def __post_init__(self) -> None:
-        shape = self.seen.inside.shape
-        if np.shape(self.order) != shape or np.shape(self.margin) != shape:
-            raise DecodeError(
-                f"expected an order and a margin for each of the {shape} pixels (h, w) around the "
-                f"object, got "
-                f"{np.shape(self.order)} and {np.shape(self.margin)}"
-            )
 
 
 def fringe_order(settings: Settings, seen: Observation, offered: FringeCandidates) -> FringeOrder:
@@ -301,26 +297,15 @@ def _rivals(cost: Image, choice: NDArray[np.int32], ruled_out: float | np.float3
 
 
 @dataclass(frozen=True)
-class Turns:
-    """Maps (3, h, w) of a turn further than the chosen order, that order, and a turn nearer:
-    ``nearness`` float32, ``misfit_rad``: distance of both phases from those there, and whether it
-    ``exists``."""
-
-    nearness: NDArray[np.float32]
-    misfit_rad: Image
-    exists: Mask
-
-
-@dataclass(frozen=True)
 class CrossedOrder:
-    """The order of crossed fringes, maps (h, w): ``candidates``; ``margin``: energy of the rival
-    order minus that of the chosen one; ``evidence``: the same difference for the cost of the
-    evidence alone; ``rival``: nearness of the best candidate but the chosen one, the chosen one's
-    own where there is no other."""
+    """The order of crossed fringes, maps float32 (h, w): ``nearness``, and ``misfit_rad``, the
+    distance of both phases from those there; ``wrong_chance``: probability that it is wrong;
+    ``rival``: nearness of the best candidate but the chosen one, the chosen one's own where there
+    is no other."""
 
-    candidates: Turns
-    margin: Image
-    evidence: Image
+    nearness: Image
+    misfit_rad: Image
+    wrong_chance: Image
     rival: Image
 
 
@@ -344,19 +329,14 @@ def crossed_order(
     rival = chosen_values(
         offered.nearness, np.where(misfit.min(axis=0) < LARGE, misfit.argmin(axis=0), index)
     )
-    count = len(offered.nearness)
-    place = index + np.array([-1, 0, 1])[:, None, None]
-    nearness, misfit, exists = (
-        seen.spread(np.take_along_axis(values, np.clip(place, 0, count - 1), axis=0))
-        for values in (offered.nearness, offered.misfit_rad, offered.exists)
+    evidence *= np.float32(evidence_weight)
+    margin = margin / np.float32(smoothness)
+    odds = evidence / EVIDENCE_SCALE + margin / ENERGY_SCALE - EVEN_ODDS
+    chance = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
+    nearness, misfit_rad = (
+        chosen_values(values, index) for values in (offered.nearness, offered.misfit_rad)
     )
-    exists &= seen.spread((place >= 0) & (place < count))
-    return CrossedOrder(
-        Turns(nearness, misfit, exists),
-        seen.spread(margin / np.float32(smoothness)),
-        seen.spread(np.float32(evidence_weight) * evidence),
-        seen.spread(rival),
-    )
+    return CrossedOrder(*map(seen.spread, (nearness, misfit_rad, chance, rival)))
 
 
 def local_median(values: Image, inside: Mask, window_px: float) -> Image:

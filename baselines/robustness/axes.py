@@ -290,19 +290,7 @@ def score(
 ) -> Scores:
     """`SCORES` of a prediction (H, W) in mm, 0 or less without an answer (a network may go below
     0), whose standard uncertainty is ``sigma_mm`` (H, W), above 0 where it is stated; ``charge_mm``
-    is what a missed or invented pixel costs. Raises PredictionError for a depth that is not finite,
-    a sigma that is not finite or below 0, and for another size."""
-    for name, values in (("depth", depth_mm), ("sigma", sigma_mm)):
-        if values is None:
-            continue
-        if values.shape != truth.depth_mm.shape:
-            raise PredictionError(
-                f"{name}: expected a map of {truth.depth_mm.shape}, got {values.shape}"
-            )
-        if not np.isfinite(values).all() or (name == "sigma" and (values < 0).any()):
-            raise PredictionError(
-                f"{name}: expected finite mm, a sigma of 0 and more; the method is at fault"
-            )
+    is what a missed or invented pixel costs. `method.checked` has passed the maps."""
     target = truth.depth_mm[truth.scored].astype(np.float64)
     if target.size == 0:
         return dict.fromkeys(SCORES)

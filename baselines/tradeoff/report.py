@@ -124,9 +124,8 @@ class Scatter:
         leading = [mark for mark in self.marks if mark.can_lead]
         return [leading[index] for index in pareto_front([(mark.x, mark.y) for mark in leading])]
 
-    def draw(self, axes: Axes) -> list[Mark]:
-        """Draw into ``axes``, whose place in the figure is fixed. Returns the marks that are shown
-        by a number."""
+    def draw(self, axes: Axes) -> None:
+        """Draw into ``axes``, whose place in the figure is fixed."""
         axes.set(xlabel=self.across, ylabel=self.up, xscale="log", yscale="log")
         left, right = axes.set_xlim(
             _ends([end for m in self.marks for end in (m.x, *(m.x_span or ()))])
@@ -172,9 +171,10 @@ class Scatter:
                 url=mark.url,
                 zorder=2,
             )
-        return self._label(axes, lines) if len(self.marks) <= _MOST_LABELLED else []
+        if len(self.marks) <= _MOST_LABELLED:
+            self._label(axes, lines)
 
-    def _label(self, axes: Axes, lines: Sequence[Bbox]) -> list[Mark]:
+    def _label(self, axes: Axes, lines: Sequence[Bbox]) -> None:
         """No label covers a mark or another label or leaves the axes. A name does not cover
         ``lines`` either, a number where possible."""
         px = axes.figure.dpi / 72
@@ -182,7 +182,7 @@ class Scatter:
         at = axes.transData.transform([(mark.x, mark.y) for mark in self.marks])
         taken = [Bbox([xy - _RADIUS * px, xy + _RADIUS * px]) for xy in at]
         places = {mark.number: place for mark, place in zip(self.marks, at, strict=True)}
-        numbered, front = [], self.front
+        front = self.front
         for mark in [*front, *(mark for mark in self.marks if mark not in front)]:
             tries = [(mark.name, _NAME_GAP, lines)] if self.names else []
             tries += [(str(mark.number), gap, more) for more in (lines, ()) for gap in _NUMBER_GAPS]
@@ -215,15 +215,12 @@ class Scatter:
                     else None,
                 )
                 taken.append(box)
-                numbered += [mark] if text != mark.name else []
                 break
-        return numbered
 
-    def svg(self, width: int, height: int, css: str, about: str) -> tuple[str, list[Mark]]:
-        """An ``svg`` element of ``width`` by ``height`` px in the page's colours, and the marks
-        shown by number. It is styled by attributes and by the page, which forbids style of its own.
-        ``css``, its classes, and ``about``, its description, tell it from other pictures of the
-        page."""
+    def svg(self, width: int, height: int, css: str, about: str) -> str:
+        """An ``svg`` element of ``width`` by ``height`` px in the page's colours. It is styled by
+        attributes and by the page, which forbids style of its own. ``css``, its classes, and
+        ``about``, its description, tell it from other pictures of the page."""
         text = io.StringIO()
         with own_settings({"svg.fonttype": "none", "svg.hashsalt": css + about, "font.size": 12}):
             figure = Figure(figsize=(width / 72, height / 72), dpi=72)
@@ -234,7 +231,7 @@ class Scatter:
             axes.yaxis.set_label_coords(17 / width, 0.5, figure.transFigure)
             axes.patch.set_visible(False)
             figure.patch.set_visible(False)
-            numbered = self.draw(axes)
+            self.draw(axes)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "Glyph .* missing")  # the browser's fonts have it
                 figure.savefig(text, format="svg", metadata={"Date": None})
@@ -251,7 +248,7 @@ class Scatter:
         content = re.sub(r"<[^>]*>", lambda match: _for_page(match[0], groups), content)
         content = re.sub(r"\s*\n\s*", " ", content)
         head = f'<svg class="{css}" viewBox="0 0 {width} {height}" role="img" aria-label="{escaped(about, 5000)}">'
-        return f"{head}{content}</svg>", numbered
+        return f"{head}{content}</svg>"
 
 
 def _round_numbers(axes: Axes) -> None:
@@ -393,7 +390,6 @@ def scatter(run: Tradeoff, cost: Cost) -> Scatter | None:
             LINE_COLOURS[methods.index(point.method) % len(LINE_COLOURS)],
             hollow=bool(point.off_front_reason),
             can_lead=not point.off_front_reason,
-            title=f"{point.title}: {point.object_mae_mm:.3g} mm, {_ms(point.seconds)} ms",
         )
         for number, point in enumerate(run.points, start=1)
         if (x := getattr(point, cost)) and point.object_mae_mm

@@ -196,29 +196,30 @@ class Recipe(StrictModel):
     @property
     def name(self) -> str:
         """Name of runs and weights; rows that train the same network have the same name."""
-        parts = [self.network, self.normalisation, self.loss.label]
-        parts += ["bgremoved"] if self.background_removed else []
-        parts += [flag for flag in _OPTION_TITLES if self.options.get(flag)]
-        parts += [self.frames] if self.frames != "single_shot" else []
-        parts += [f"seed_{self.seed}"] if self.seed != SEED else []
-        parts += ["fold_{}_of_{}".format(*self.fold)] if self.fold is not None else []
-        return "-".join(parts)
+        return "-".join(self._described())
 
     @property
     def title(self) -> str:
         """For people: network, normalisation, loss, and the settings that differ from the paper's
         usual ones."""
-        parts = [
-            NETWORK_TITLES[self.network],
-            self.normalisation,
-            self.loss.label.replace("_", " "),
-        ]
-        parts += ["background removed"] if self.background_removed else []
-        parts += [title for flag, title in _OPTION_TITLES.items() if self.options.get(flag)]
-        parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
-        parts += [f"seed {self.seed}"] if self.seed != SEED else []
-        parts += ["fold {} of {}".format(*self.fold)] if self.fold is not None else []
-        return ", ".join(parts)
+        return ", ".join(self._described().values())
+
+    def _described(self) -> dict[str, str]:
+        """Each part of the name, and of the title."""
+        label, frames = self.loss.label, self.frames
+        parts = {self.network: NETWORK_TITLES[self.network], self.normalisation: self.normalisation}
+        parts[label] = label.replace("_", " ")
+        if self.background_removed:
+            parts["bgremoved"] = "background removed"
+        parts |= {flag: title for flag, title in _OPTION_TITLES.items() if self.options.get(flag)}
+        if frames != "single_shot":
+            parts[frames] = f"trained on {frames} frames"
+        if self.seed != SEED:
+            parts[f"seed_{self.seed}"] = f"seed {self.seed}"
+        if self.fold is not None:
+            fold = "fold {} of {}".format(*self.fold)
+            parts[fold.replace(" ", "_")] = fold
+        return parts
 
     @property
     def epochs(self) -> int:
@@ -282,7 +283,7 @@ def recipe_from_dict(content: dict[str, Any], path: Path = Path("recipe")) -> Re
         return Recipe.model_validate(content)
     except ValidationError as error:
         lines = "\n  ".join(problems_of(error))
-        raise RecipeError(f"{printable(str(path), 500)} is no valid recipe:\n  {lines}") from None
+        raise RecipeError(f"{printable(path)} is no valid recipe:\n  {lines}") from None
 
 
 def _recipe_path(name_or_path: str | Path) -> Path:

@@ -414,4 +414,4 @@ def _check_finite(path: Path, tensors: "Mapping[str, Tensor]") -> None:
 
 
 def _fault(path: Path, words: str) -> WeightsError:
-    return WeightsError(f"{printable(str(path), 500)}{words}")
+    return WeightsError(f"{printable(path)}{words}")

@@ -3,7 +3,7 @@ and a sentence. Samples that are hard for both methods cancel in the difference.
 therefore tell two methods apart whose own intervals overlap."""
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Annotated
 
@@ -95,6 +95,7 @@ def compare(first: Result, second: Result) -> Comparison:
     summaries = {
         key: paired_difference([row.differences[key] for row in paired], owners) for key in keys
     }
+    ranked_by = ("two-sided MAE", RANK_KEY) if charged else ("object MAE", OBJECT_KEY)
     names = printable(first.submission.name), printable(second.submission.name)
     if names[0] == names[1]:
         names = f"{names[0]} (first)", f"{names[1]} (second)"
@@ -105,7 +106,7 @@ def compare(first: Result, second: Result) -> Comparison:
         split=first.dataset.split,
         **{key: getattr(first, key) for key in ("target", "track", "mode")},
         differences=summaries,
-        sentence=sentence(*names, *_ranked_by(summaries)),
+        sentence=sentence(*names, ranked_by[0], summaries[ranked_by[1]]),
         per_sample=paired,
     )
 
@@ -153,13 +154,6 @@ def paired_difference(values: Sequence[float | None], owners: Sequence[str]) -> 
         lower=sum(value < 0 for value in differences),
         higher=sum(value > 0 for value in differences),
     )
-
-
-def _ranked_by(summaries: Mapping[str, Difference]) -> tuple[str, Difference]:
-    """What the two are ranked by, in words, and its difference."""
-    if RANK_KEY in summaries:
-        return "two-sided MAE", summaries[RANK_KEY]
-    return "object MAE", summaries[OBJECT_KEY]
 
 
 def sentence(first: str, second: str, error: str, difference: Difference) -> str:

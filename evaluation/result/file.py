@@ -39,13 +39,6 @@ _OTHER_FILES = {
 """JSON files of this package that are no results, by a key that only they have."""
 
 
-def result_content(result: Result) -> dict[str, Any]:
-    """The file's content as plain values, keys in the model's order, each sample's name first."""
-    content = result.model_dump(mode="json")
-    content["per_sample"] = [{"sample": row.pop("sample"), **row} for row in content["per_sample"]]
-    return content
-
-
 def _json_bytes(content: Any) -> bytes:
     return (
         json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n"
@@ -53,8 +46,11 @@ def _json_bytes(content: Any) -> bytes:
 
 
 def result_json(result: Result) -> bytes:
-    """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order."""
-    return _json_bytes(result_content(result))
+    """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order, each sample's name
+    first."""
+    content = result.model_dump(mode="json")
+    content["per_sample"] = [{"sample": row.pop("sample"), **row} for row in content["per_sample"]]
+    return _json_bytes(content)
 
 
 def write_result(result: Result, path: Path) -> None:
@@ -75,9 +71,7 @@ def write_file(content: bytes, path: Path, new_folder: bool = False) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, content)
     except OSError as error:
-        raise SubmissionError(
-            f"{printable(str(path), 500)} can't be written: {error.strerror}"
-        ) from None
+        raise SubmissionError(f"{printable(path)} can't be written: {error.strerror}") from None
 
 
 def read_result(path: Path) -> Result:
@@ -93,7 +87,7 @@ def read_json(path: Path) -> Any:
 
 def parse_result(content: Any, path: Path) -> Result:
     """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
-    file = printable(str(path), 500)
+    file = printable(path)
     keys = content if isinstance(content, dict) else {}
     for key, what in _OTHER_FILES.items():
         if key in keys:

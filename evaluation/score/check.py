@@ -284,7 +284,7 @@ class Checked:
         """The description of a folder without problems; PredictionError names them where there are
         any."""
         if self.problems or self.description is None:
-            folder = printable(str(self.listing.folder), 500)
+            folder = printable(self.listing.folder)
             raise PredictionError(
                 f"{folder} can't be used, {len(self.problems)} problems:", self.problems
             )
@@ -316,7 +316,7 @@ def checked_description(
         problem = f"png_mm_per_level is given, but the predictions are {form}; remove the key"
     else:
         return description
-    raise SubmissionError(f"{printable(str(folder / SUBMISSION_FILE), 500)}: {problem}")
+    raise SubmissionError(f"{printable(folder / SUBMISSION_FILE)}: {problem}")
 
 
 def check_folder(
@@ -330,7 +330,7 @@ def check_folder(
     listing = list_folder(folder, dataset, split)
     if dataset is None and not listing.present:
         expected = "expected one {sample}.npy for each sample, found none"
-        raise PredictionError(f"{printable(str(folder), 500)}: {expected}; tables need DATASET")
+        raise PredictionError(f"{printable(folder)}: {expected}; tables need DATASET")
     problems, description = list(listing.problems), None
     try:
         description = checked_description(folder, read_plain(folder), listing.form, dataset)
@@ -361,12 +361,12 @@ def _declared_size(listing: Listing) -> tuple[int, int]:
     read."""
     if listing.form == ".mat":
         raise PredictionError(
-            f"{printable(str(listing.folder), 500)}: .mat files can only be checked with DATASET"
+            f"{printable(listing.folder)}: .mat files can only be checked with DATASET"
         )
     files = [listing.folder / f"{sample}{listing.form}" for sample in listing.present]
     declared = {file: size for file in files if (size := declared_size(file)) and min(size) > 0}
     if not declared:
-        named = printable(str(listing.folder), 500)
+        named = printable(listing.folder)
         raise PredictionError(f"{named}: no file holds a depth map (H, W); write them with np.save")
     size = Counter(declared.values()).most_common(1)[0][0]
     if max(size) > LARGEST_SIDE_PX:
@@ -375,9 +375,7 @@ def _declared_size(listing: Listing) -> tuple[int, int]:
             f"expected at most {LARGEST_SIDE_PX} without a dataset; write the depth map itself, or "
             f"give DATASET"
         )
-        raise PredictionError(
-            f"{printable(str(file), 500)}: declares {size[1]} x {size[0]} px, {most}"
-        )
+        raise PredictionError(f"{printable(file)}: declares {size[1]} x {size[0]} px, {most}")
     return size
 
 

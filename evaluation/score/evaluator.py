@@ -125,9 +125,9 @@ def evaluate(
     if problems:
         summary = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
         lines = [str(refusal), *problems] if refusal else problems
-        raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
+        raise PredictionError(f"{printable(folder)} can't be scored, {summary}:", lines)
     if refusal or description is None:
-        raise refusal or SubmissionError(f"{printable(str(folder), 500)}: has no description")
+        raise refusal or SubmissionError(f"{printable(folder)}: has no description")
     if note := another_reading(
         "the predictions", [sample.seen for sample in scored if sample.seen is not None]
     ):

@@ -506,10 +506,7 @@ def score_sigma(
     """Score the stated standard uncertainty ``sigma_mm`` of ``prediction_mm`` over the object
     pixels of ``target_mm`` that are not ``void``; all (H, W), in mm, sigma of 0 and more. With
     ``charge_mm`` that is the error of a pixel without an answer, and the invented pixels of the
-    background, whose error it is too, are left out or kept with the object's. Raises
-    PredictionError for another shape."""
-    if not prediction_mm.shape == target_mm.shape == sigma_mm.shape:
-        raise PredictionError(f"sigma: expected a map of {target_mm.shape}, got {sigma_mm.shape}")
+    background, whose error it is too, are left out or kept with the object's."""
     surface = object_mask(target_mm)
     inside = surface if void is None else surface & ~void
     depth, sigma = (np.asarray(values[inside], np.float64) for values in (prediction_mm, sigma_mm))

@@ -188,13 +188,13 @@ def write_template(folder: Path) -> Path:
     """Write `TEMPLATE` as ``submission.yaml`` into ``folder``, made if absent; its path.
     SubmissionError where there is one already, or where it can't be written."""
     path = folder / SUBMISSION_FILE
-    name = printable(str(path), 500)
+    name = printable(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
             file.write(TEMPLATE)
     except FileExistsError:
-        where = name if folder.is_dir() else printable(str(folder), 500)
+        where = name if folder.is_dir() else printable(folder)
         raise SubmissionError(
             f"{where} is there already and is not overwritten; give another folder"
         ) from None

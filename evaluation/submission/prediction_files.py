@@ -52,7 +52,7 @@ def read_plain(folder: Path) -> dict[Any, Any]:
     if path.is_symlink() or not path.is_file():
         actual = "a symbolic link" if path.is_symlink() else "none"
         raise SubmissionError(
-            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
+            f"expected a file {printable(path)} that describes the predictions, found "
             f"{actual}; fpp-bench "
             "predict writes one, PROTOCOL.md lists its keys"
         )
@@ -66,7 +66,7 @@ def read_plain_file(
     line looks like. The error ``raised`` names the file, what is wrong with it and what to do."""
     content = read_yaml(path, raised, "correct it, with short names and settings", _MAX_BYTES)
     if not isinstance(content, dict):
-        file = printable(str(path), 500)
+        file = printable(path)
         raise raised(
             f"{file}: expected keys and values like {example}, got {type(content).__name__}"
         )
@@ -151,7 +151,7 @@ def predictions_folder(folder: str | Path) -> Path:
     """``folder``, if there is one; else PredictionError."""
     if not Path(folder).is_dir():
         raise PredictionError(
-            f"expected a folder of predictions, found none at {printable(str(folder), 500)}"
+            f"expected a folder of predictions, found none at {printable(Path(folder))}"
         )
     return Path(folder)
 
@@ -473,7 +473,7 @@ def depth_maps(
         _check_columns(table.schema)
         rows = _rows(table.column("sample").to_pylist(), samples)
     except PredictionError as error:
-        raise PredictionError(f"{printable(str(path), 500)} {error}") from None
+        raise PredictionError(f"{printable(path)} {error}") from None
     digest = hashlib.sha256(content).hexdigest()
 
     def depth_map(sample: str) -> MapAndHash:

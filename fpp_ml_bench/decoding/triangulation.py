@@ -58,15 +58,12 @@ _LEAST_HARMONIC = 0.01
 straight, and nothing is removed."""
 _MEDIAN_OF_SQUARE = (0.4549, 0.6931, 0.7887, 0.8392, 0.8703, 0.8914)
 """Median of chi^2 / n for 1 to 6 degrees of freedom; (1 - 2 / (9 n))^3 for more."""
-SYSTEMATIC_RAD = 0.005
-"""Error of a phase that is no noise: light of further bounces, mostly. With it 68% intervals hold
-68% of the pixels of the validation objects in the light ``paper`` (`fpp-bench predict classical
-DATASET --split validation` and `fpp-eval` with ``--split validation --target depth_exact``); larger
-errors are more frequent than in a normal distribution."""
 STATED_SYSTEMATIC_RAD = 0.015
-"""The same error as it is stated: 95% intervals of 18 steps then hold 95% of these pixels, which
-0.005 rad does of 85%; 96% in the light ``workshop`` and 93% in ``hard``, with the calibration's
-error."""
+"""Error of a phase that is no noise: light of further bounces, mostly. With it 95% intervals of 18
+steps hold 95% of the pixels of the validation objects in the light ``paper`` (`fpp-bench predict
+classical DATASET --split validation` and `fpp-eval` with ``--split validation --target
+depth_exact``), 96% in ``workshop`` and 93% in ``hard``, with the calibration's error. 68% intervals
+would hold 68% with 0.005 rad, but larger errors are more frequent than in a normal distribution."""
 
 
 class DepthFromBoth(NamedTuple):

@@ -111,9 +111,7 @@ def write_page(
                 if _OWN_PAGES.fullmatch(path.name) and f"{SUBMISSIONS}/{path.name}" not in files:
                     path.unlink()
     except OSError as error:
-        raise SubmissionError(
-            f"{printable(str(out), 500)} can't be written: {error.strerror}"
-        ) from None
+        raise SubmissionError(f"{printable(out)} can't be written: {error.strerror}") from None
     return [out / name for name in files]
 
 
@@ -187,24 +185,22 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
     parts = [about] if row.unseen is None else [about, row.unseen.row]
     bars = [(mean, name) for name, mean in row.object_means(group.sort).items()]
     changes = about.reliance.parts.titled() if about.reliance else {}
+    scored = []
+    for part in parts:
+        benchmark = part.dataset.known
+        data = part.dataset.name if benchmark is None else benchmark.title
+        scored.append((f"{data}, {part.dataset.split} split", _score_cells(part)))
     return {
         "row": row,
         "group": group,
         "rows": len(group.ranked),
         "assumption_sentences": assumption_sentences,
         "columns": columns,
-        "scored": [(_data_words(part), _score_cells(part)) for part in parts],
+        "scored": scored,
         "bars": sorted(bars, key=lambda bar: (-bar[0], bar[1])),
         "longest_mm": max(bars, default=(0.0, ""))[0],
         "parts": [(words, f"{value:.2f}") for words, value in changes.items() if value is not None],
     }
-
-
-def _data_words(row: Row) -> str:
-    benchmark = row.dataset.known
-    return (
-        f"{row.dataset.name if benchmark is None else benchmark.title}, {row.dataset.split} split"
-    )
 
 
 def _score_cells(row: Row) -> list[tuple[str, str, str]]:
@@ -255,7 +251,7 @@ def predicted_samples(
                 why = error
         if not of_folder:
             raise SubmissionError(
-                f"{printable(str(folder), 500)}: no given result was scored from it ({why})"
+                f"{printable(folder)}: no given result was scored from it ({why})"
             )
         samples |= of_folder
     return samples
@@ -459,7 +455,7 @@ def overview_figures(groups: Sequence[Group]) -> list[dict[str, Any]]:
         )
         about += f". {groups[0].key.data_title}"
         sizes = [
-            picture.svg(width, height, f"{css} scatter", about)[0] for css, width, height in SIZES
+            picture.svg(width, height, f"{css} scatter", about) for css, width, height in SIZES
         ]
         figures.append({"cost": cost, "pictures": sizes, "front": front})
     return figures

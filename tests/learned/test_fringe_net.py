@@ -10,7 +10,7 @@ import pytest
 from fpp_ml_bench.baselines.learned.fringe_net import Fringes, LinePart, PairPart, phases_of
 from fpp_ml_bench.baselines.learned.method import FringeNetMethod
 from fpp_ml_bench.baselines.learned.scenes import photographed
-from fpp_ml_bench.baselines.learned.warp import PLACES, signs_of
+from fpp_ml_bench.baselines.learned.warp import PLACES, Warp, signs_of
 from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
 from fpp_ml_bench.baselines.phase.observe import OneCarrier, TwoCarriers
 from fpp_ml_bench.baselines.phase.route import one_carrier, two_carriers
@@ -59,12 +59,11 @@ def _true_phases(rig: Rig, fringes: str, depth_mm: np.ndarray) -> np.ndarray:
     return OneCarrier(rig, Settings(direction=fringes)).layer.absolute_phase(depth)[None]
 
 
-def _warped(fringes: Fringes, phases: np.ndarray, inside: np.ndarray) -> Perfect:
-    """What a perfect network would answer in the image that ``fringes`` give it."""
-    warp = fringes.warp
+def _warped(warp: Warp, phases: np.ndarray, inside: np.ndarray) -> Perfect:
+    """What a perfect network would answer in the image that ``warp`` gives it."""
     if not warp.needed:
         return Perfect(phases, inside)
-    size, move = warp._frame(inside.shape)
+    size, move = warp.frame(inside.shape)
     affine = np.column_stack([warp.matrix, move])
 
     def taken(image: np.ndarray) -> np.ndarray:
@@ -101,7 +100,7 @@ def test_perfect_phases_give_perfect_depth(name: str) -> None:
     if fringes == "crossed":
         model = TwoCarriers(rig)
         carriers = model.carriers
-        step_rad, signs = carriers.step_rad, signs_of(carriers)
+        step_rad, signs = carriers.step_rad, signs_of(carriers.gain)
     else:
         model = OneCarrier(rig, Settings(direction=fringes))
         phase = model.layer.absolute_phase(1800.0)
@@ -109,9 +108,9 @@ def test_perfect_phases_give_perfect_depth(name: str) -> None:
         signs = np.array([np.sign(np.median(model.layer.gain))])
     seen = model.observe(images[0])
     inside = depth_mm > 0
-    empty = Fringes.of(step_rad, signs, [])
-    network = _warped(empty, truth[:, *seen.crop], inside[seen.crop])
-    both = Fringes.of(step_rad, signs, [network])  # type: ignore[list-item]
+    warp = Warp.of(step_rad, signs)
+    network = _warped(warp, truth[:, *seen.crop], inside[seen.crop])
+    both = Fringes([network], warp)  # type: ignore[list-item]
     assert both.warp.needed == (name != "crossed")
     if fringes == "crossed":
         route = two_carriers(model, PairPart(both).before, PairPart.after)

@@ -35,7 +35,7 @@ def test_both_carriers_come_to_those_that_were_learned(name: str) -> None:
     and phases measured there come back as those of the image."""
     rig = OTHERS[name]
     carriers, learned = (Carriers.of(one, one.crossed) for one in (rig, LEARNED))
-    warp = Warp.of(carriers.step_rad, signs_of(carriers))
+    warp = Warp.of(carriers.step_rad, signs_of(carriers.gain))
     assert warp.needed
     y, x = np.mgrid[:90, :120]
     phases = carriers.step_rad[:, :1, None] * x + carriers.step_rad[:, 1:, None] * y
@@ -44,7 +44,7 @@ def test_both_carriers_come_to_those_that_were_learned(name: str) -> None:
     own_y, own_x = np.mgrid[: image.shape[0], : image.shape[1]]
     waves = [np.exp(1j * (along_x * own_x + along_y * own_y)) for along_x, along_y in warp.step_rad]
     place = np.linalg.inv(warp.matrix) @ (
-        np.stack([own_x, own_y]).reshape(2, -1) + warp._frame((90, 120))[1][:, None] * -1
+        np.stack([own_x, own_y]).reshape(2, -1) + warp.frame((90, 120))[1][:, None] * -1
     )
     seen = ((place > 12) & (place < np.array([[107], [77]]))).all(axis=0).reshape(image.shape)
     basis = np.stack(
@@ -69,7 +69,7 @@ def test_both_carriers_come_to_those_that_were_learned(name: str) -> None:
 
 def test_the_known_rig_is_left_as_it_is() -> None:
     carriers = Carriers.of(LEARNED, LEARNED.crossed)
-    assert not Warp.of(carriers.step_rad, signs_of(carriers)).needed
+    assert not Warp.of(carriers.step_rad, signs_of(carriers.gain)).needed
     assert not Warp.of(np.array([[0.002, TAU / 18.1]]), np.ones(1)).needed
 
 
@@ -86,6 +86,6 @@ def test_one_carrier_is_turned_and_scaled_to_grow_downwards(sign: int) -> None:
     assert np.linalg.det(warp.matrix) == pytest.approx((period_px / 9) ** 2)  # not mirrored
     image = warp.image((100 + 50 * np.cos(phase)).astype(np.float32))
     down = TAU / period_px * np.arange(image.shape[0])[:, None] + np.zeros(image.shape)
-    offset = warp._frame((60, 80))[1][1] * TAU / period_px
+    offset = warp.frame((60, 80))[1][1] * TAU / period_px
     (back,) = warp.back(wrapped(down - offset)[None].astype(np.float32), [], (60, 80))
     assert np.abs(wrapped(sign * back[0] - phase)).max() < 1e-3

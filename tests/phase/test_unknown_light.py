@@ -11,8 +11,8 @@ import pytest
 from flat_planes import RIG, photograph, plane_depth_m, plane_fringe
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.phase import geometry
 from fpp_ml_bench.baselines.phase.depth import Reason
-from fpp_ml_bench.baselines.phase.geometry import Periods
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
 from fpp_ml_bench.baselines.phase.observe import OneCarrier
 from fpp_ml_bench.baselines.phase.route import one_carrier
@@ -122,15 +122,16 @@ def test_a_dim_texture_is_not_taken_for_the_background() -> None:
     assert not measurement.depth_mm.any()
 
 
-def test_long_periods_are_measured_on_a_smaller_image() -> None:
+def test_long_periods_are_measured_on_a_smaller_image(monkeypatch: pytest.MonkeyPatch) -> None:
     row = photograph(
         "cracker_box", "A60", replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
     )
     rig = replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
     assert rig.image_px_per_period("horizontal") > 60
     errors = []
-    for periods in (None, Periods(longest=1e9)):  # resampled, and not
-        model = OneCarrier(rig, Settings(), periods=periods)
+    for longest_px in (geometry.LONGEST_PX, 1e9):  # resampled, and not
+        monkeypatch.setattr(geometry, "LONGEST_PX", longest_px)
+        model = OneCarrier(rig, Settings())
         measurement = one_carrier(model).measure(row.frames[0])
         target = row.depth_mm > 0
         assert measurement.depth_mm.shape == target.shape
@@ -146,14 +147,18 @@ def test_long_periods_are_measured_on_a_smaller_image() -> None:
     assert errors[0] < 1.1 * errors[1] + 1
 
 
-def test_what_comes_back_is_interpolated_but_not_across_a_jump() -> None:
+def test_what_comes_back_is_interpolated_but_not_across_a_jump(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(geometry, "LONGEST_PX", 9)
+    monkeypatch.setattr(geometry, "BEST_PX", 8)
     depth_m = plane_depth_m(LONG, 1.7, (0.05, 0.1))
     right = np.arange(240) >= 120
     image = plane_fringe(LONG, 18, depth_m)
     image[:, right] = plane_fringe(LONG, 18, depth_m + 0.25)[:, right]
     exact_mm = 1000 * (depth_m + 0.25 * right)
     told = {"white_grey": 180.0, "ambient_grey": 6.0}
-    model = OneCarrier(LONG, Settings("vertical", **told), periods=Periods(0, 8, 9))  # type: ignore[arg-type]
+    model = OneCarrier(LONG, Settings("vertical", **told))  # type: ignore[arg-type]
     assert model.resampling.needed and model.rig.camera.width < 60
     assert (
         model.resampling.captured_crop((slice(0, 10), slice(1, model.rig.camera.width)))[1].stop
@@ -164,7 +169,7 @@ def test_what_comes_back_is_interpolated_but_not_across_a_jump() -> None:
     error = np.abs(measurement.depth_mm - exact_mm)[:, away][60:180]
     assert np.median(error) < 5
     empty = np.zeros((240, 240), np.uint8)
-    assert not one_carrier(OneCarrier(LONG, periods=Periods(0, 8, 9))).measure(empty).depth_mm.any()
+    assert not one_carrier(OneCarrier(LONG)).measure(empty).depth_mm.any()
 
 
 def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

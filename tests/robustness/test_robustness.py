@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.baselines.learned.scenes import HELD_OUT, drawn_light
-from fpp_ml_bench.baselines.method import Answer, Method
+from fpp_ml_bench.baselines.method import Answer, Method, checked
 from fpp_ml_bench.baselines.robustness import axes
 from fpp_ml_bench.baselines.robustness.axes import (
     CLEAN,
@@ -212,17 +212,18 @@ def test_stating_no_sigma_at_all_is_no_coverage():
 
 
 def test_no_number_is_refused():
-    depth = truth().depth_mm.copy()
-    depth[0, 0] = np.nan
-    with pytest.raises(PredictionError, match="depth: expected finite mm"):
-        score(depth, None, truth(), RULES, CHARGE_MM)
-    with pytest.raises(PredictionError, match="sigma: expected finite mm"):
-        score(truth().depth_mm, depth, truth(), RULES, CHARGE_MM)
-    depth[0, 0] = -1.0
-    with pytest.raises(PredictionError, match="sigma: expected finite mm"):
-        score(truth().depth_mm, depth, truth(), RULES, CHARGE_MM)
-    with pytest.raises(PredictionError, match="expected a map of"):
-        score(depth[:-1], None, truth(), RULES, CHARGE_MM)
+    depth = truth().depth_mm.astype(np.float32)
+    bad, size = depth.copy(), depth.shape
+    bad[0, 0] = np.nan
+    with pytest.raises(PredictionError, match="here: the method gave values that are not finite"):
+        checked(Answer(bad), size, "here")
+    with pytest.raises(PredictionError, match="not finite"):
+        checked(Answer(depth, bad), size, "here")
+    bad[0, 0] = -1.0
+    with pytest.raises(PredictionError, match="a sigma below 0"):
+        checked(Answer(depth, bad), size, "here")
+    with pytest.raises(PredictionError, match="expected float32"):
+        checked(Answer(depth[:-1]), size, "here")
 
 
 def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
