@@ -7,6 +7,7 @@ from tiny_network import SMALL, one_thread  # noqa: F401
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.networks.base import (
+    Attention,
     DropPath,
     InstanceNorm,
     trains_channels_last,
@@ -82,6 +83,22 @@ def test_instance_norm_is_torchs(affine, layout):
     torch_gradients = torch.autograd.grad((torchs(x) * weight).sum(), [x, *torchs.parameters()])
     torch.testing.assert_close(our_gradients, torch_gradients, rtol=1e-10, atol=1e-10)
     assert torch.autograd.gradcheck(ours, (x,))
+
+
+def test_attention_is_a_plain_softmax():
+    attention = Attention(12, heads=3).double()
+    tokens = torch.randn(2, 7, 12, dtype=torch.float64)
+    q, k, v = attention.qkv(tokens).chunk(3, dim=-1)
+    mixed = []
+    for head in range(3):
+        part = slice(4 * head, 4 * head + 4)
+        scores = (
+            q[..., part] @ k[..., part].transpose(1, 2) / 2.0
+        )  # square root of the head's 4 channels
+        mixed.append(torch.softmax(scores, dim=-1) @ v[..., part])
+    torch.testing.assert_close(
+        attention(tokens), attention.out(torch.cat(mixed, dim=-1)), rtol=1e-10, atol=1e-10
+    )
 
 
 def test_drop_path_keeps_the_mean_and_sleeps_outside_training():
