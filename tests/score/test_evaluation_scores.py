@@ -61,3 +61,16 @@ def test_combine_is_the_union():
     assert combined.mae_mm == pytest.approx(float(np.abs(union).mean()), rel=1e-14)
     assert combined.rmse_mm == pytest.approx(float(np.sqrt((union**2).mean())), rel=1e-14)
     assert combine(EMPTY, EMPTY) == EMPTY
+
+
+@pytest.mark.parametrize("scale", [1e-160, 1e-300, 5e-324])
+def test_errors_whose_squares_vanish_have_an_rmse_all_the_same(scale):
+    errors = scale * np.arange(1, 101, dtype=np.float64).reshape(10, 10)
+    target = np.zeros((10, 10))
+    target[:5] = 256 * scale
+    scores = score_sample(target + errors, target)
+    sets = ((scores.overall, errors), (scores.object, errors[:5]), (scores.background, errors[5:]))
+    for stats, part in sets:
+        ratio = float(np.sqrt(np.mean((part / part.max()) ** 2)) * part.max())
+        assert stats.rmse_mm == pytest.approx(ratio, rel=1e-12, abs=5e-324)
+        assert stats.rmse_mm > 0
