@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from scored_dataset import write_predictions
+from scored_dataset import HARDWARE, write_predictions
 
 from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, WITHIN_MM
@@ -32,8 +32,6 @@ from fpp_ml_bench.leaderboard.row_file import (
 from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.storage import benchmark
 from fpp_ml_bench.loaders.storage.benchmark import Benchmark
-
-HARDWARE = {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"}
 
 
 def timing(ms: float, frames: int = 1, **changes: Any) -> dict[str, Any]:
@@ -62,12 +60,12 @@ def timing(ms: float, frames: int = 1, **changes: Any) -> dict[str, Any]:
 def write_result_file(
     path: Path, dataset: Any, offset_mm: float, noise_mm: float = 0.0, **changes: Any
 ) -> Path:
-    """Write the result of predictions off by ``offset_mm`` and noise; ``changes`` go into
-    submission.yaml."""
+    """Write the result of predictions off by ``offset_mm`` and noise, of the test split against
+    decoded depth; ``changes`` are another ``split`` or ``target``, or go into submission.yaml."""
     folder = path.parent / f"{path.stem}-predictions"
-    target = changes.pop("target", "depth")
-    write_predictions(folder, dataset, offset_mm=offset_mm, noise_mm=noise_mm, **changes)
-    write_result(evaluate(folder, dataset, target=target), path)
+    split, target = changes.pop("split", "test"), changes.pop("target", "depth")
+    write_predictions(folder, dataset, split, offset_mm, noise_mm, **changes)
+    write_result(evaluate(folder, dataset, split, target), path)
     return path
 
 

@@ -1,8 +1,10 @@
 """Scenes of the phase routes' tests: an object, and a fringe on a plane that fills the frame, from
 the benchmark's own light and sensor: what its builder can't place."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,15 +56,27 @@ def plane_depth_m(
     return distance_m / (1 - tilt[0] * x - tilt[1] * y)
 
 
-def plane_fringe(
+def turned(rig: Rig, degrees: float, translation_m: tuple[float, float, float]) -> Rig:
+    """``rig`` with a projector that is turned about the vertical axis, and stands elsewhere."""
+    cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    rotation = ((cosine, 0.0, sine), (0.0, 1.0, 0.0), (-sine, 0.0, cosine))
+    return replace(rig, rotation=rotation, translation_m=translation_m)
+
+
+def plane_fringe(rig: Rig, frame: int, *plane: Any, **light: Any) -> NDArray[np.uint8]:
+    """Frame ``frame`` of `plane_frames`."""
+    return plane_frames(rig, [frame], *plane, **light)[frame]
+
+
+def plane_frames(
     rig: Rig,
-    frame: int,
+    indices: Sequence[int],
     depth_m: NDArray[np.float64],
     tilt: tuple[float, float] = (0.0, 0.0),
     noise: float = 1.0,
     light: Light = PAPER,
-) -> NDArray[np.uint8]:
-    """Frame ``frame`` of a matte plane, uint8 (H, W)."""
+) -> list[Any]:
+    """The rig's frames of a matte plane, uint8 (H, W) at ``indices`` and else None."""
     x, y = rig.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None]
     normal = np.array([tilt[0], tilt[1], -1.0])
@@ -71,4 +85,8 @@ def plane_fringe(
     exposure = Exposure.of(rig, light)
     lit = light_surface(points.reshape(-1, 3), normals.reshape(-1, 3), rig, light, exposure.pattern)
     pixels = np.arange(x.size, dtype=np.uint32)
-    return exposure.expose([frame], lit, pixels, (7, "plane", frame))[0].reshape(x.shape)
+    frames: list[Any] = [None] * len(rig.sequence)
+    images = exposure.expose(list(indices), lit, pixels, (7, "plane", 0))
+    for index, image in zip(indices, images, strict=True):
+        frames[index] = image.reshape(x.shape)
+    return frames

@@ -22,6 +22,7 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 
 OBJECTS = {"train": ("bowl",), "validation": ("mug",), "test": ("power_drill", "wooden_boards")}
 VIEWS = ("A0", "A60")
+HARDWARE = {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"}
 DESCRIPTION: dict[str, Any] = {
     "name": "A method",
     "method": "test",
@@ -30,13 +31,7 @@ DESCRIPTION: dict[str, Any] = {
     "uses_ground_truth_range": False,
     "seconds_per_sample": 0.25,
     "seconds_source": "measured",
-    "hardware": {
-        "cpu": "Some CPU",
-        "cores": 2,
-        "memory_gib": 8.0,
-        "gpu": None,
-        "platform": "Linux",
-    },
+    "hardware": {**HARDWARE},  # YAML that names one object twice has an alias
     "software": {"numpy": "2.0.0"},
     "settings": {"steps": 18},
 }
@@ -52,6 +47,15 @@ def disk_depth(size: tuple[int, int], seed: int) -> NDArray[np.float32]:
     inside = (rows - row) ** 2 + (columns - column) ** 2 < (rng.uniform(0.15, 0.3) * min(size)) ** 2
     depth = 1800.0 + 0.2 * (columns - column) + 200.0 * (rows > row)
     return np.where(inside, depth, 0.0).astype(np.float32)
+
+
+def noise_scene(size: tuple[int, int]) -> "Scene":
+    """Frames of noise, each of a disk of its own."""
+
+    def scene(seed: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        return np.random.default_rng(seed).integers(1, 256, size, np.uint8), disk_depth(size, seed)
+
+    return scene
 
 
 Scene = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.float32]]]

@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SUBPACKAGES = ("loaders", "evaluation", "baselines", "leaderboard")
 
 
-def _setuptools() -> dict:
-    return tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+def _pyproject() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 def _package_folders() -> dict[str, str]:
@@ -68,7 +68,7 @@ def test_packages_come_from_their_folders(monkeypatch):
 
 def test_every_data_file_is_installed():
     """Files beside the modules are in the wheel; the rows' pictures, 9 MB, are not."""
-    data = _setuptools()["package-data"]
+    data = _pyproject()["tool"]["setuptools"]["package-data"]
     left = []
     for name, folder in _package_folders().items():
         patterns = data.get(name, ())
@@ -76,77 +76,60 @@ def test_every_data_file_is_installed():
             ROOT / other for other in _package_folders().values() if other.startswith(f"{folder}/")
         ]
         for file in sorted((ROOT / folder).rglob("*")):
-            own = not any(file.is_relative_to(other) for other in inner)
-            if (
-                own
-                and file.is_file()
-                and file.suffix not in (".py", ".pyc", ".png", ".nbi", ".nbc")
-            ):
-                left += (
-                    [file]
-                    if not any(file.relative_to(ROOT / folder).match(p) for p in patterns)
-                    else []
-                )
+            if not file.is_file() or any(file.is_relative_to(other) for other in inner):
+                continue
+            listed = any(file.relative_to(ROOT / folder).match(p) for p in patterns)
+            if not listed and file.suffix not in (".py", ".pyc", ".png", ".nbi", ".nbc"):
+                left.append(file)
     assert left == []
 
 
-def test_checkout_as_current_folder_brings_its_own_subpackages():
-    code = "import fpp_ml_bench, importlib\n" + "".join(
-        f"print(importlib.import_module('fpp_ml_bench.{subpackage}').__file__)\n"
-        for subpackage in SUBPACKAGES
-    )
-    printed = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
-    ).stdout.split()
-    assert printed == [str(ROOT / subpackage / "__init__.py") for subpackage in SUBPACKAGES]
+def test_checkout_as_current_folder_brings_its_own_subpackages_and_nothing_else():
+    names = [f"fpp_ml_bench.{name}" for name in (*SUBPACKAGES, "tests", "benchmarks")]
+    code = f"from importlib.util import find_spec as find\nfor name in {names}:\n"
+    found = _python("-c", f"{code}    print(getattr(find(name), 'origin', None))").split()
+    own = [str(ROOT / subpackage / "__init__.py") for subpackage in SUBPACKAGES]
+    assert found == [*own, "None", "None"]
+
+
+def _python(*words: str) -> str:
+    """What Python prints in the checkout."""
+    return subprocess.run(
+        [sys.executable, *words], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
 
 
 def test_module_run_is_the_command():
-    done = subprocess.run(
-        [sys.executable, "-m", "fpp_ml_bench", "--version"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0
-    assert done.stdout.startswith("fpp-ml-bench ")
+    assert _python("-m", "fpp_ml_bench", "--version").startswith("fpp-ml-bench ")
 
 
 def test_dependencies_flow_one_way():
     """core <- loaders <- evaluation <- baselines <- leaderboard; only the commands import all of
     them."""
-    order = ("core", *SUBPACKAGES)
+    order = ("fpp_ml_bench", *SUBPACKAGES)
+    for path, module in _imports():
+        top, *inner = path.relative_to(ROOT).parts
+        doors = {"cli", "__init__.py", "__main__.py", "api.py"}
+        if top == "fpp_ml_bench" and inner[0] in doors:
+            continue
+        for later_package in order[order.index(top) + 1 :]:
+            assert f"fpp_ml_bench.{later_package}." not in f"{module}.", path
+
+
+def _imports():
+    """Each module of the package, and what it imports, with all dots."""
     for top in ("fpp_ml_bench", *SUBPACKAGES):
-        position = order.index("core" if top == "fpp_ml_bench" else top)
         for path in (ROOT / top).rglob("*.py"):
-            relative = path.relative_to(ROOT).parts
-            if relative[:2] == ("fpp_ml_bench", "cli") or (
-                path.name in ("__init__.py", "__main__.py", "api.py") and position == 0
-            ):
-                continue
-            text = path.read_text()
-            for later_package in order[position + 1 :]:
-                assert f"fpp_ml_bench.{later_package}" not in text or _only_in_prose(
-                    text, later_package
-                ), f"{path} imports {later_package}"
-
-
-def _only_in_prose(text: str, subpackage: str) -> bool:
-    return not any(
-        line.strip().startswith(
-            (f"from fpp_ml_bench.{subpackage}", f"import fpp_ml_bench.{subpackage}")
-        )
-        for line in text.splitlines()
-    )
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Import):
+                    yield from ((path, alias.name) for alias in node.names)
+                elif isinstance(node, ast.ImportFrom) and not node.level:
+                    yield from ((path, f"{node.module}.{alias.name}") for alias in node.names)
 
 
 def test_the_project_refers_to_no_outside_folder():
-    elsewhere = {
-        ".git",
-        ".venv",
-        "build",
-        "tmp",
-    }  # tmp: of CI, where other tests make and remove folders meanwhile
+    # tmp: of CI, where other tests make and remove folders meanwhile
+    elsewhere = {".git", ".venv", "build", "tmp"}
     for folder, inner, names in os.walk(ROOT):
         inner[:] = [name for name in inner if name not in elsewhere]
         for path in (Path(folder, name) for name in names):
@@ -165,42 +148,20 @@ sys.exit(evaluate(words[1:]) if words[0] == "fpp-eval" else main(words))
 """
 
 
-def _without_extras(folder, *words):
-    command = [sys.executable, "-c", WITHOUT_EXTRAS, *map(str, words)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
-
-
 @pytest.mark.parametrize(
     ("words", "library", "extra"),
     [
-        (("train", "loss/l1", "DATA", "--out", "run"), "(torch|accelerate)", "train"),
-        (("predict", "fringe-net", "DATA", "--out", "predictions"), "torch", "train"),
-        (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "safetensors", "train"),
-        (
-            ("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"),
-            "torch",
-            "train",
-        ),
-        (
-            (
-                "build",
-                "--out",
-                "more",
-                "--objects",
-                "cork",
-                "--size",
-                "176",
-                "--cluster",
-                "127.0.0.1:1",
-            ),
-            "ray",
-            "cluster",
-        ),
-        (("stability", "--quick", "--out", "out"), "(mpmath|torch)", "(diagnose|train)"),
+        ("train loss/l1 DATA --out run", "(torch|accelerate)", "train"),
+        ("predict fringe-net DATA --out predictions", "torch", "train"),
+        ("tradeoff DATA --quick --out tradeoff", "safetensors", "train"),
+        ("diagnose unet-individual-rmse DATA --quick --out report", "torch", "train"),
+        ("build --out more --objects cork --size 176 --cluster 127.0.0.1:1", "ray", "cluster"),
+        ("stability --quick --out out", "(mpmath|torch)", "(diagnose|train)"),
     ],
 )
 def test_a_missing_library_is_answered_with_its_extra(tiny, tmp_path, words, library, extra):
-    done = _without_extras(tmp_path, *(str(tiny) if word == "DATA" else word for word in words))
+    command = [sys.executable, "-c", WITHOUT_EXTRAS, *words.replace("DATA", str(tiny)).split()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert re.search(
         rf"this needs {library}, which is not installed; pip install 'fpp-ml-bench\[{extra}\]'",
@@ -209,9 +170,7 @@ def test_a_missing_library_is_answered_with_its_extra(tiny, tmp_path, words, lib
 
 
 def test_every_extra_lists_its_libraries():
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
-        "optional-dependencies"
-    ]
+    extras = _pyproject()["project"]["optional-dependencies"]
     for extra, libraries in EXTRAS.items():
         assert set(libraries) <= {re.split(r"[>=\[]", line)[0] for line in extras[extra]}
 
@@ -219,17 +178,10 @@ def test_every_extra_lists_its_libraries():
 def test_every_imported_library_is_a_dependency():
     """What the package imports is of the standard library, a base dependency, or of an extra that
     `EXTRAS` names."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = _pyproject()["project"]
     names = {"yaml": "pyyaml", "PIL": "pillow", "cv2": "opencv-contrib-python-headless"}
     base = {re.split(r"[>=\[]", line)[0].lower() for line in project["dependencies"]}
-    imported = set()
-    for top in ("fpp_ml_bench", *SUBPACKAGES):
-        for path in (ROOT / top).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.Import):
-                    imported |= {alias.name.partition(".")[0] for alias in node.names}
-                elif isinstance(node, ast.ImportFrom) and not node.level:
-                    imported.add(str(node.module).partition(".")[0])
+    imported = {module.partition(".")[0] for _, module in _imports()}
     outside = (
         imported - set(sys.stdlib_module_names) - {"fpp_ml_bench"} - set(sum(EXTRAS.values(), ()))
     )
@@ -253,20 +205,9 @@ def test_ci_runs_every_command_without_extras():
     assert ".ci/without_extras" in steps and '"$work/clean/bin/fpp-bench" demo' in steps
 
 
-def test_nothing_else_of_a_checkout_is_importable():
-    code = (
-        "import importlib.util as u; print(u.find_spec('fpp_ml_bench.tests'), "
-        "u.find_spec('fpp_ml_bench.benchmarks'))"
-    )
-    printed = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
-    ).stdout
-    assert printed == "None None\n"
-
-
 def test_constraints_pin_what_every_extra_brings():
     """Of packages that are installed, also what they need in turn."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = _pyproject()["project"]
     lines = [
         line.split("#")[0].strip() for line in (ROOT / "constraints.txt").read_text().splitlines()
     ]
@@ -313,7 +254,7 @@ def test_constraints_are_those_of_the_lock_file():
 
 
 def test_one_version_and_one_date_of_the_release():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = _pyproject()["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     preferred = citation["preferred-citation"]["version"]
     assert {citation["version"], preferred, project["version"]} == {fpp_ml_bench.__version__}

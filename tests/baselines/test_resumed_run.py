@@ -63,6 +63,7 @@ def test_it_goes_on_behind_the_last_finished_sample(dataset, stopped):
     assert {path.name for path in stopped.iterdir()} >= {"submission.yaml", "per_sample.json"}
     assert not list(stopped.glob("*.jsonl")) + list(stopped.glob("*.tmp"))
     reports = read_json(stopped / "per_sample.json")
+    assert list(reports) == dataset.samples(SPLIT)
     assert [report["number"] for report in reports.values()] == [2, 3, 2, 3]
     submission = yaml.safe_load((stopped / "submission.yaml").read_text())
     assert (

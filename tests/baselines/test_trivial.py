@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import fpp_bench, refusal
-from scored_dataset import disk_depth, make_dataset
+from conftest import fpp_bench
+from scored_dataset import make_dataset, noise_scene
 
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import predict_split
@@ -20,12 +20,8 @@ SIZE = (96, 96)
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    def scene(seed):
-        frame = np.random.default_rng(seed).integers(0, 255, SIZE, dtype=np.uint8)
-        return frame, disk_depth(SIZE, seed)
-
-    views = ("A0", "A60", "A120", "A180")
-    made = make_dataset(tmp_path_factory.mktemp("data") / "tiny", SIZE, views=views, scene=scene)
+    folder, views = tmp_path_factory.mktemp("data") / "tiny", ("A0", "A60", "A120", "A180")
+    made = make_dataset(folder, SIZE, views=views, scene=noise_scene(SIZE))
     replace(made.manifest, rig=paper_rig(96).to_dict()).write(made.path)  # the rig of such images
     return DatasetFolder(made.path)
 
@@ -64,14 +60,13 @@ def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):
     assert len(list((tmp_path / "q").glob("*.npy"))) == 8
 
 
-def test_what_can_not_be_searched_is_refused(dataset, tmp_path):
+def test_what_can_not_be_searched_or_placed_is_refused(dataset):
     with pytest.raises(PredictionError, match="needs the training split"):
         load_method("nearest", paper_rig(96))
     with pytest.raises(PredictionError, match=r"expected training images of 48x48 px"):
         load_method("nearest", paper_rig(48), training=dataset)
-    assert "--training is an option of nearest" in refusal(
-        fpp_bench, "predict", "classical", dataset.path, "--training", "x", "--out", tmp_path / "p"
-    )
+    with pytest.raises(PredictionError, match="at 'nowhere': expected standoff"):
+        load_method("constant", paper_rig(96), at="nowhere")
     with pytest.raises(PredictionError, match="nearest needs frame 0"):
         NearestMethod(paper_rig(96), training=dataset).predict([None])
 

@@ -2,6 +2,7 @@
 says."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,16 +93,8 @@ def test_direct_light_keeps_projector_sensor_and_brightness():
     hard = named_light("hard")
     direct = direct_light(hard)
     assert direct.projector == hard.projector and direct.ambient_grey == hard.ambient_grey
-    off = {
-        "gloss",
-        "textures",
-        "interreflection",
-        "shadows",
-        "ambient occlusion",
-        "lens blur",
-        "vignetting",
-        "calibration error",
-    }
+    off = {"gloss", "textures", "interreflection", "shadows", "ambient occlusion"}
+    off |= {"lens blur", "vignetting", "calibration error"}
     assert {name for name, on in hard.stages().items() if on and not direct.stages()[name]} <= off
     assert not any(direct.stages()[name] for name in off)
     low, high = hard.camera.exposure
@@ -283,15 +276,6 @@ def test_samples_are_spread_over_objects_and_views(opened):
         outlines and outlines[0].split("_")[0] != sample.split("_")[0]
         for sample, outlines in chosen
     )
+    empty = SimpleNamespace(path=opened.path, samples_by_object=lambda split: {})
     with pytest.raises(DiagnosisError, match="no sample with an object"):
-        chosen_samples_of_nothing(opened)
-
-
-def chosen_samples_of_nothing(opened):
-    class Empty:
-        path = opened.path
-
-        def samples_by_object(self, split):
-            return {}
-
-    return chosen_samples(Empty(), "test", 2)
+        chosen_samples(empty, "test", 2)

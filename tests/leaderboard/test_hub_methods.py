@@ -19,6 +19,7 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 pytestmark = pytest.mark.long
 
 SIZE = 224
+FRAMES = [np.random.default_rng(0).integers(0, 256, (SIZE, SIZE), np.uint8)] * 52
 CODE = """
 import numpy as np
 from fpp_ml_bench import Method
@@ -56,11 +57,15 @@ def client(tmp_path_factory):
         yield client
 
 
-def loaded(client, address, out, trust="", options=None):
-    words = [sys.executable, "-c", LOAD, address, trust, str(out), json.dumps(options or {})]
+def run(client, code, *words):
+    command = [sys.executable, "-c", code, *map(str, words)]
     return subprocess.run(
-        words, env=client.environment(), capture_output=True, text=True, timeout=120
+        command, env=client.environment(), capture_output=True, text=True, timeout=120
     )
+
+
+def loaded(client, address, out, trust="", options=None):
+    return run(client, LOAD, address, trust, out, json.dumps(options or {}))
 
 
 def depth_of(client, address, tmp_path, trust="", options=None):
@@ -76,8 +81,7 @@ def test_weights_are_published_and_used_from_there(client, tmp_path):
     assert list(listed(said)) == ["README.md", "config.json", "fpp-bench.json", "model.safetensors"]
     config = json.loads(client.server.repos["models", "alice/unet"].files["config.json"])
     assert config["network"] == "unet" and config["fpp_ml_bench"] == {}
-    frames = [np.random.default_rng(0).integers(0, 256, (SIZE, SIZE), np.uint8) for _ in range(52)]
-    here = load_method("unet-raw-rmse", paper_rig(SIZE)).predict(frames)
+    here = load_method("unet-raw-rmse", paper_rig(SIZE)).predict(FRAMES)
     assert np.array_equal(depth_of(client, "hf://alice/unet", tmp_path), here)
     commit = client.server.repos["models", "alice/unet"].commits[-1]
     commit = commit if isinstance(commit, str) else commit[0]
@@ -99,10 +103,9 @@ def test_a_method_of_this_package_with_its_options(client, tmp_path):
     client.server.repos["models", "alice/three"] = Repo(
         files={"config.json": b'{"fpp_ml_bench": {"method": "classical", "options": {"steps": 3}}}'}
     )
-    frames = [np.random.default_rng(0).integers(0, 256, (SIZE, SIZE), np.uint8) for _ in range(52)]
-    here = load_method("classical", paper_rig(SIZE), steps=3).predict(frames)
+    here = load_method("classical", paper_rig(SIZE), steps=3).predict(FRAMES)
     assert np.array_equal(depth_of(client, "hf://alice/three", tmp_path), here)
-    other = load_method("classical", paper_rig(SIZE), steps=4).predict(frames)
+    other = load_method("classical", paper_rig(SIZE), steps=4).predict(FRAMES)
     assert np.array_equal(
         depth_of(client, "hf://alice/three", tmp_path, options={"steps": 4}), other
     )
@@ -136,16 +139,10 @@ def test_what_is_no_method_is_a_message(client, tmp_path, address, files, said):
 
 def test_predict_takes_an_address_and_its_options(client, tmp_path):
     dataset = make_dataset(tmp_path / "dataset", size=(SIZE, SIZE))
-    words = [sys.executable, "-c", MAIN, "predict", "hf://alice/flat"]
-    words += [str(dataset.path), "--out", str(tmp_path / "out")]
-    refused, run = (
-        subprocess.run(
-            [*words, *more], env=client.environment(), capture_output=True, text=True, timeout=120
-        )
-        for more in ((), ("--trust",))
-    )
+    words = ["predict", "hf://alice/flat", dataset.path, "--out", tmp_path / "out"]
+    refused, done = (run(client, MAIN, *words, *more) for more in ((), ("--trust",)))
     assert refused.returncode == 2 and "--trust" in refused.stderr
-    assert run.returncode == 0, run.stderr
+    assert done.returncode == 0, done.stderr
     described = yaml.safe_load((tmp_path / "out" / "submission.yaml").read_text())
     assert described["settings"]["repository"].startswith("hf://alice/flat@")
 

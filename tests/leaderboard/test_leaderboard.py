@@ -1,23 +1,21 @@
 """The leaderboard: ranking, groups, the paper's rows, and what a hostile result file can do
 (nothing)."""
 
+import html
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import fpp_bench, fpp_eval, printed, read_json, refusal
-from scored_dataset import make_dataset, write_predictions
+from board_rows import write_result_file
+from conftest import file_bytes, fpp_bench, fpp_eval, printed, read_json, refusal
+from scored_dataset import make_dataset
 
-from fpp_ml_bench.evaluation.result.file import write_result
-from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard import ranking, rows
+from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.ranking import cut_at_word
 from fpp_ml_bench.leaderboard.tables import SHOWN_BY_DEFAULT, paper_tables
 from fpp_ml_bench.paper import AVERAGE, paper_layers
 from fpp_ml_bench.tables import markdown_text
-
-SHIPPED = rows.SHIPPED_ROWS
 
 
 @pytest.fixture(autouse=True)
@@ -32,15 +30,10 @@ def elsewhere(tmp_path, monkeypatch):
 def make(tmp_path, dataset):
     """Score predictions off by ``offset_mm`` and write the result as ``file``."""
 
-    def act(
-        file: str, offset_mm: float, split: str = "test", target: str = "depth", **changes
-    ) -> Path:
-        folder = tmp_path / "predictions" / file
-        write_predictions(folder, dataset, split, offset_mm=offset_mm, **changes)
+    def act(file, offset_mm, **changes):
         path = tmp_path / "here" / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_result(evaluate(folder, dataset, split, target), path)
-        return path
+        path.parent.mkdir(exist_ok=True)
+        return write_result_file(path, dataset, offset_mm, **changes)
 
     return act
 
@@ -50,7 +43,7 @@ def board(*arguments):
 
 
 def ranked(tmp_path, *arguments: object) -> list[dict]:
-    assert fpp_bench("leaderboard", *arguments, "--json", tmp_path / "board") == 0
+    board(*arguments, "--json", tmp_path / "board")
     return read_json(tmp_path / "board")["groups"]
 
 
@@ -81,20 +74,17 @@ def test_unknown_time_comes_last(make, tmp_path):
 
 def test_what_differs_in_data_or_rules_is_never_ranked_together(make, tmp_path):
     larger = make_dataset(tmp_path / "larger", size=(40, 40))
-    folder = write_predictions(tmp_path / "p", larger)
-    write_result(evaluate(folder, larger), tmp_path / "larger.json")
     files = [
         make("metric.json", 1.0),
         make("oracle.json", 1.0, uses_ground_truth_range=True),
         make("exact.json", 1.0, target="depth_exact"),
         make("train.json", 1.0, split="train"),
-        tmp_path / "larger.json",
+        write_result_file(tmp_path / "larger.json", larger, 0.0),
     ]
     groups = ranked(tmp_path, *files)
     assert [len(group["rows"]) for group in groups] == [1] * 5
     assert [group["track"] for group in groups] == ["metric"] * 4 + ["oracle range"]
-    out = board(*files)
-    out = " ".join(out.split())
+    out = " ".join(board(*files).split())
     for words in (
         "metric track, test split, against exact depth",
         "oracle range track, test split, against decoded depth",
@@ -200,8 +190,7 @@ def test_paper_tables_by_choice(choice, tmp_path):
 
 
 def test_paper_rows_stay_out_of_the_ranking(make, tmp_path):
-    path = make("a.json", 1.0)
-    assert fpp_bench("leaderboard", path, "--json", tmp_path / "board") == 0
+    board(make("a.json", 1.0), "--json", tmp_path / "board")
     content = read_json(tmp_path / "board")
     assert [row["name"] for group in content["groups"] for row in group["rows"]] == ["A method"]
     assert [table["name"] for table in content["reported_by_others"]] == list(SHOWN_BY_DEFAULT)
@@ -213,16 +202,13 @@ HOSTILE = (
 
 
 def test_submitted_text_is_only_text(make, tmp_path):
-    path = make("a.json", 1.0, name=HOSTILE)
-    board(path, "--markdown", tmp_path / "t.md")
-    line = next(line for line in (tmp_path / "t.md").read_text().splitlines() if "script" in line)
-    head = (tmp_path / "t.md").read_text().splitlines()[2]
+    board(make("a.json", 1.0, name=HOSTILE), "--markdown", tmp_path / "t.md")
+    lines = (tmp_path / "t.md").read_text().splitlines()
+    (line,), head = [line for line in lines if "script" in line], lines[2]
     assert line.count("|") == head.count("|")
     short, *_, full = (cell.strip() for cell in line.split("|")[1:-1])
     for cell in (short, full):
         assert not set("`<>[]!*@\\:") & set(cell) and "www." not in cell
-    import html
-
     assert html.unescape(full) == HOSTILE[:90] + ("..." if len(HOSTILE) > 90 else "")
     assert html.unescape(short) == cut_at_word(HOSTILE)
 
@@ -235,26 +221,17 @@ def test_terminals_show_names_as_they_are(name, make, monkeypatch):
 
 @pytest.mark.parametrize("text", ["a|b", "*", "Größe 3 µm", "WwW.x.y", "~~s~~", "1. x", "$x$"])
 def test_markdown_text_shows_exactly_the_text(text):
-    import html
-
     assert html.unescape(markdown_text(text)) == text
     assert not set("|*~$") & set(markdown_text(text)) and "www." not in markdown_text(text).lower()
 
 
 def test_files_are_the_same_bytes_every_time(make, tmp_path):
     files = [make("a.json", 1.0, name="a"), make("b.json", 2.0, name="b")]
-    for run in ("1", "2"):
-        order = files if run == "1" else files[::-1]
-        arguments = [
-            *map(str, order),
-            "--markdown",
-            str(tmp_path / f"{run}.md"),
-            "--json",
-            str(tmp_path / f"{run}.j"),
-        ]
-        assert fpp_bench("leaderboard", *arguments) == 0
-    assert (tmp_path / "1.md").read_bytes() == (tmp_path / "2.md").read_bytes()
-    assert (tmp_path / "1.j").read_bytes() == (tmp_path / "2.j").read_bytes()
+    for run, order in (("1", files), ("2", files[::-1])):
+        out = tmp_path / run
+        out.mkdir()
+        board(*order, "--markdown", out / "board.md", "--json", out / "board.json")
+    assert file_bytes(tmp_path / "1") == file_bytes(tmp_path / "2")
 
 
 def test_unsound_files_are_refused_by_name(make, tmp_path, capsys):
@@ -280,10 +257,7 @@ def test_the_files_that_this_package_writes_are_told_apart(tiny, make, capsys):
         capsys.readouterr()
         error = refusal(fpp_bench, "leaderboard", first, path)
         assert error.count("\n") == 1 and f"{path} is not a result file but {what}" in error
-    for words in (
-        ["compare", str(first), "board.json"],
-        ["verify", "board.json", "predictions", "data"],
-    ):
+    for words in (["compare", first, "board.json"], ["verify", "board.json", "p", "data"]):
         assert "board.json is not a result file but a ranking" in refusal(fpp_eval, *words)
     board(first, "--row", "row.json")
     assert fpp_eval("compare", "row.json", second) == 0
@@ -306,7 +280,7 @@ def test_named_results_are_shown_without_tables_of_others(make):
     assert "Reported by others" in Path("board.md").read_text()
 
 
-def test_repetition_is_refused(make, tmp_path):
+def test_what_can_not_be_read_or_written_and_repetition_are_refused(make, tmp_path):
     first, second = make("first.json", 1.0), make("second.json", 2.0)
     message = refusal(fpp_bench, "leaderboard", first, second)
     assert "first.json" in message and "second.json" in message and "another name" in message
@@ -318,36 +292,18 @@ def test_repetition_is_refused(make, tmp_path):
     assert "nowhere.json: can't be read: No such file" in refusal(
         fpp_bench, "leaderboard", "nowhere.json"
     )
-
-
-def test_shipped_rows_are_sound():
-    """Every row that ships with the package is read and ranked as strictly as any other."""
-    files = sorted(SHIPPED.glob("*.json"))
-    groups = ranking.rank(ranking.read_entries(files))
-    shown = sum(1 + (row.unseen is not None) for group in groups for row in group.rows)
-    assert shown + sum(
-        "same predictions" in note for group in groups for note in group.notes
-    ) == len(files)
-
-
-def test_unwritable_output_is_an_error(make, tmp_path):
-    assert "can't be written" in refusal(
-        fpp_bench, "leaderboard", make("a.json", 1.0), "--json", tmp_path / "no" / "board.json"
-    )
+    out = tmp_path / "no" / "board.json"
+    assert "can't be written" in refusal(fpp_bench, "leaderboard", first, "--json", out)
 
 
 @pytest.mark.parametrize("width", [80, 100, 300])
 def test_numbers_stay_whole_in_narrow_terminals(width, make, monkeypatch):
-    path = make(
-        "a.json", 1234.5, name="A rather long name of a method, with both directions and 18 steps"
-    )
+    name = "A rather long name of a method, with both directions and 18 steps"
+    path = make("a.json", 1234.5, name=name)
     monkeypatch.setenv("COLUMNS", str(width))
     out = board(path, "--sort", "object_edge_mae_mm", "--paper", "none")
     assert all(len(line) <= width for line in out.splitlines())
-    assert (
-        f"│ {cut_at_word('A rather long name of a method, with both directions and 18 steps')} │"
-        in out
-    )
+    assert f"│ {cut_at_word(name)} │" in out
     assert out.count("1234.500") == {80: 2, 100: 3, 300: 6}[width]
     header = out.split("┡")[0]
     assert "Edge" in header, "the rows are sorted by it"

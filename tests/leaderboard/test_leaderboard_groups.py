@@ -28,10 +28,13 @@ def shipped():
     return read_entries(shipped_rows())
 
 
-def test_shipped_rows_stay_sorted_by_rank_and_error(shipped):
+def test_shipped_rows_are_shown_and_stay_sorted_by_rank_and_error(shipped):
     """Of two rows that the tests don't tell apart, the one that fewer others may be ahead of comes
     first."""
+    shown = 0
     for group in rank(shipped):
+        shown += sum(1 + (row.unseen is not None) for row in group.rows)
+        shown += sum("same predictions" in note for note in group.notes)
         keys = [
             (row.best_rank or 0, row.worst_rank or 0, row.value(row.rank_key)) for row in group.rows
         ]
@@ -45,6 +48,7 @@ def test_shipped_rows_stay_sorted_by_rank_and_error(shipped):
             if first[0] and first[1] < second[0]
         ]
         assert all(first[2] < second[2] for first, second in told_apart)
+    assert shown == len(shipped)
 
 
 def with_content(entry, digit):

@@ -52,9 +52,7 @@ TEN = [f"object {n}" for n in range(10)]
 def random_errors(seed, rows=5):
     rng = np.random.default_rng(seed)
     hard = rng.exponential(1.0, 10)
-    return {
-        f"row {n}": (hard * (1 + n / 2) + rng.uniform(0, 1.5, 10)).tolist() for n in range(rows)
-    }
+    return {f"row {n}": (hard * (1 + n / 2) + rng.uniform(0, 1.5, 10)) for n in range(rows)}
 
 
 def test_ranks_follow_from_the_pairs_that_are_told_apart(base):
@@ -70,8 +68,8 @@ def test_ranks_follow_from_the_pairs_that_are_told_apart(base):
         assert row.worst_rank == len(errors) - sum(row.entry.name == better for _, better in behind)
     adjusted = holm([pair.p for pair in group.pairs])
     for pair, p_holm in zip(group.pairs, adjusted, strict=True):
-        differences = np.subtract(errors[pair.second], errors[pair.first])
-        assert pair.p == sign_flip_p(differences.tolist()) and pair.p_holm == p_holm
+        differences = errors[pair.second] - errors[pair.first]
+        assert pair.p == sign_flip_p(differences) and pair.p_holm == p_holm
         assert pair.difference == pytest.approx(differences.mean()) and pair.objects == 10
         assert (
             pair.behind == (p_holm <= 0.05)
@@ -248,16 +246,8 @@ def test_files_have_the_pairs_and_the_rows(base, tmp_path, monkeypatch):
     for entry, path in zip(entries, paths, strict=True):
         write_row(entry.row, path)
     monkeypatch.setenv("COLUMNS", "160")
-    files = [
-        "--csv",
-        str(tmp_path / "t.csv"),
-        "--json",
-        str(tmp_path / "t.json"),
-        "--paper",
-        "none",
-        "--pairs",
-    ]
-    output = printed(fpp_bench, "leaderboard", *paths, *files)
+    files = ["--csv", tmp_path / "t.csv", "--json", tmp_path / "t.json"]
+    output = printed(fpp_bench, "leaderboard", *paths, *files, "--paper", "none", "--pairs")
     assert "Pairs of these rows" in output and "second is behind" in output
     (group,) = read_json(tmp_path / "t.json")["groups"]
     assert [(row["best_rank"], row["object_mae_mm"]) for row in group["rows"]] == [
@@ -295,7 +285,6 @@ def tables():
 
 
 @pytest.mark.long
-@pytest.mark.long
 def test_who_is_behind_whom_is_what_the_listed_pairs_say():
     """Bounds of p values leave out most tests, and change no verdict."""
     told_apart = 0
@@ -316,13 +305,10 @@ def test_who_is_behind_whom_is_what_the_listed_pairs_say():
 
 
 def test_a_table_of_hundreds_of_rows_is_ranked_and_lists_no_pairs(base):
-    errors = np.random.default_rng(2).lognormal(0, 1, (300, 1)) * np.random.default_rng(3).uniform(
-        1, 1.3, (300, 25)
-    )
+    rng = np.random.default_rng(2)
+    errors = rng.lognormal(0, 1, (300, 1)) * rng.uniform(1, 1.3, (300, 25))
     names = [f"object {n}" for n in range(25)]
-    (group,) = rank(
-        entries_of(base, {f"row {n}": row for n, row in enumerate(errors.tolist())}, names)
-    )
+    (group,) = rank(entries_of(base, {f"row {n}": row for n, row in enumerate(errors)}, names))
     assert len(group.ranked) == 300 and group.pairs == () and group.rows[-1].best_rank > 250
     content = json.loads(table_json([group], []))
     assert content["groups"][0]["pairs"] is None and len(content["groups"][0]["rows"]) == 300
@@ -357,9 +343,12 @@ def test_what_a_row_keeps_of_a_stated_uncertainty(tmp_path, dataset):
 
 def test_what_a_result_says_beyond_its_scores(base):
     """Blocks that a result may have: what the method learned from, and its scored uncertainty."""
+
+    def titles(row):
+        return {column.title for column in columns("object_mae_mm") if column.shown_for([row])}
+
     (row,) = rank([base])[0].rows
     assert learned_from(base.row) == "" and uncertainty(base) == RowUncertainty()
-    shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
     assert not {
         "In 95%",
         "AUSE",
@@ -368,13 +357,12 @@ def test_what_a_result_says_beyond_its_scores(base):
         "Rank",
         "x trivial",
         "On unseen",
-    } & set(shown)
+    } & titles(row)
     stated = RowUncertainty(within_95_share=0.9, ause_mae_mm=1.5, sure_mae_mm=0.7, sure_rmse_mm=2.1)
     learned = {"learned_from": LearnedFrom(data="generated")}
     (row,) = rank([changed(base, uncertainty=stated, submission=learned)])[0].rows
     assert learned_from(row.entry.row) == "generated"
-    shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
-    assert {"In 95%", "AUSE", "Surest 95%", "Learned from"} < set(shown)
+    assert {"In 95%", "AUSE", "Surest 95%", "Learned from"} < titles(row)
     assert surest(row.entry) == "0.700 / 2.100" and surest(base) == "-"
 
 

@@ -32,8 +32,8 @@ def files(tmp_path_factory):
     """Results of one frame, one of which was told the range, two of a full sequence, and one of few
     frames."""
     work = tmp_path_factory.mktemp("rows")
-    dataset, made = make_dataset(work / "tiny"), []
-    for name, offset_mm, about in (
+    dataset = make_dataset(work / "tiny")
+    rows = (
         ("Fast and rough", 4.0, {"frames_used": [0], "timing": timing(2.0)}),
         ("Slow and fine", 0.5, {"frames_used": [0], "timing": timing(50.0)}),
         (
@@ -45,11 +45,11 @@ def files(tmp_path_factory):
         ("Classical, best", 0.2, {"frames_used": [*range(50)], "method": "classical"}),
         ("Classical, worse", 0.3, {"frames_used": [*range(50)], "method": "classical"}),
         ("Few", 0.1, {"frames_used": [0, 1]}),
-    ):
-        made.append(
-            write_result_file(work / f"{name}.json", dataset, offset_mm, 0.1, name=name, **about)
-        )
-    return made
+    )
+    return [
+        write_result_file(work / f"{name}.json", dataset, offset_mm, 0.1, name=name, **about)
+        for name, offset_mm, about in rows
+    ]
 
 
 @pytest.fixture
@@ -176,15 +176,9 @@ def test_a_row_stays_vouched_for_when_more_of_it_is_measured(files, tmp_path, mo
         return 0
 
     monkeypatch.setattr(upkeep, "fpp_bench", measure)
-    assert (
-        upkeep.main(
-            ["measured", str(row), "reliance", "phase", "data/full", "--direction", "vertical"]
-        )
-        == 0
-    )
-    assert ran == [
-        ["reliance", "phase", "data/full", "--direction", "vertical", "--into", str(row)]
-    ]
+    words = ["reliance", "phase", "data/full", "--direction", "vertical"]
+    assert upkeep.main(["measured", str(row), *words]) == 0
+    assert ran == [[*words, "--into", str(row)]]
     after = sha256(row.read_bytes()).hexdigest()
     assert after != before and (tmp_path / "vouched.txt").read_text() == f"{after} | measured\n"
 

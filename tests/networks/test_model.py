@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_network import config_of, rounding_error, tiny_network
+from tiny_network import SMALL, config_of, rounding_error, tiny_network
 
 from fpp_ml_bench import baselines
-from fpp_ml_bench.baselines.networks.model import load
+from fpp_ml_bench.baselines.networks.model import NETWORKS, load
 from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.errors import PredictionError, WeightsError
 
@@ -107,21 +107,11 @@ def test_an_output_that_is_no_number(tmp_path, fringe):
         load(path).predict(fringe)
 
 
-@pytest.mark.parametrize(
-    "name", ["unet", "transunet", "resunet", "hformer", "pix2pix", "pix2pix_unet"]
-)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_every_network_comes_back_as_it_was(tmp_path, name):
-    width = {"hformer": 8, "transunet": 4}.get(name, 2)
-    if name == "transunet":
-        network, size = tiny_network(name, width, map_size=6), (96, 96)
-    else:
-        network = tiny_network(name, width)
-        size = (network.stride * 2, network.stride * 3)
-    save_weights(
-        tmp_path / "net.safetensors",
-        network,
-        config_of(network, image_size=size, normalisation="raw"),
-    )
+    network, size = tiny_network(name, **SMALL[name]), (64, 64)
+    config = config_of(network, image_size=size, normalisation="raw")
+    save_weights(tmp_path / "net.safetensors", network, config)
     model = load(tmp_path / "net.safetensors", "cpu")
     image = np.random.default_rng(1).random(size, dtype=np.float32)
     with torch.no_grad():

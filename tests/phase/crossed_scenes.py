@@ -47,7 +47,12 @@ def frame(
     ]
     white = np.where(depth_mm > 0, white_grey, background_grey)
     grey = ambient_grey + white * (0.5 + 0.5 * (waves[0] + waves[1])) ** gamma
-    noise = np.random.default_rng(7 + number).normal(0, noise_grey, grey.shape)
+    return noisy(grey, noise_grey, 7 + number)
+
+
+def noisy(grey: NDArray, noise_grey: float = 0.7, seed: int = 3) -> NDArray[np.uint8]:
+    """What a camera makes of ``grey`` levels, uint8 of the same shape."""
+    noise = np.random.default_rng(seed).normal(0, noise_grey, grey.shape)
     return np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from crossed_scenes import frame, route, slab
+from crossed_scenes import frame, noisy, route, slab
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask, observe
@@ -47,18 +47,13 @@ def test_a_wall_without_visible_fringes(wall_grey: float) -> None:
     """Blurred out, or no wall: half of the slab has less modulation than would count as a fringe by
     itself."""
     image = shown(white_grey=np.where(X < 160, 14.0, 150.0))
-    plain = wall_grey + np.random.default_rng(3).normal(0, 0.7, image.shape)
-    missed, invented = shares(
-        np.where(INSIDE, image, np.clip(np.rint(plain), 0, 255)).astype(np.uint8)
-    )
+    missed, invented = shares(np.where(INSIDE, image, noisy(np.full(image.shape, wall_grey))))
     assert missed < 0.02 and invented < 0.01
 
 
 def test_texture_over_wall_and_object(monkeypatch: pytest.MonkeyPatch) -> None:
     painted = np.rint(6 + CHECKS * (shown(noise_grey=0.0).astype(float) - 6))
-    image = np.clip(
-        np.rint(painted + np.random.default_rng(5).normal(0, 0.7, painted.shape)), 0, 255
-    ).astype(np.uint8)
+    image = noisy(painted, seed=5)
     missed, invented = shares(image)
     assert missed < 0.01 and invented < 0.06
     monkeypatch.setattr(empty_scene, "TEXTURED", np.inf)
@@ -83,8 +78,7 @@ def test_dark_paint_is_not_unlit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_shadow_that_other_light_reaches_is_no_object(monkeypatch: pytest.MonkeyPatch) -> None:
     shadow = (X < 60) & ~INSIDE
-    plain = 14.0 + np.random.default_rng(8).normal(0, 0.7, shadow.shape)
-    image = np.where(shadow, np.rint(plain), shown()).astype(np.uint8)
+    image = np.where(shadow, noisy(np.full(shadow.shape, 14.0), seed=8), shown())
 
     def answered() -> float:
         return float((route(CUT, FAMILY).measure(image).depth_mm > 0)[shadow].mean())
@@ -199,8 +193,7 @@ def like_the_wall(true: Rig) -> NDArray[np.float64]:
 def test_a_flat_object_is_not_taken_for_the_wall(true: Rig) -> None:
     image = frame(like_the_wall(true), true, FAMILY)
     if true is CUT:
-        empty = 3.0 + np.random.default_rng(4).normal(0, 0.7, image.shape)
-        image = np.where(INSIDE, image, np.clip(np.rint(empty), 0, 255)).astype(np.uint8)
+        image = np.where(INSIDE, image, noisy(np.full(image.shape, 3.0), seed=4))
     missed, invented = shares(image)
     assert missed < 0.1 and invented < 5e-3
 

@@ -49,31 +49,6 @@ def test_dark_and_blurred_corners_are_no_object(fringes: str) -> None:
     assert _invented(WIDE, LENSES, fringes) < 0.01
 
 
-def _quadratic_lamp_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    def light(self, phases):
-        first, second = (
-            (weight * np.cos(phase)).astype(np.float32)
-            for weight, phase in zip(self._carriers.family.weights, phases, strict=True)
-        )
-        fall_off = self._lit * empty_scene.plane_irradiance(self._carriers.rig, self._depth_m)
-        _, x, y = empty_scene._linear(self._carriers.rig)
-        pattern = 1 + first + second
-        terms = [fall_off * term * pattern for term in empty_scene._quadratic(x, y)]
-        terms += [fall_off * pattern**power for power in empty_scene.RESPONSE_POWERS]
-        terms += [fall_off * first, fall_off * second, np.ones_like(x)]
-        return [term.astype(np.float32) for term in terms]
-
-    monkeypatch.setattr(empty_scene.CrossedEmptyScene, "_light", light)
-
-
-def test_a_lamp_without_lenses_would_find_objects_in_the_corners(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The control: the model of the plane that knew the paper's rig."""
-    _quadratic_lamp_alone(monkeypatch)
-    assert _invented(WIDE, LENSES, "crossed") > 0.02
-
-
 NARROW = replace(RIG, projector=replace(RIG.projector, width=700, cx=455.5))
 """A projector that leaves a quarter of the wall dark."""
 

@@ -1,34 +1,21 @@
 """Two and more frames of one direction, and the choice of how many a scene needs."""
 
-import json
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
-from flat_planes import PAPER, USERS_WORD
-from synthetic import make
+from flat_planes import RIG, USERS_WORD, plane_depth_m, plane_frames
 
-from fpp_ml_bench.baselines.method import Answer, Method
-from fpp_ml_bench.baselines.phase.local_fit import FringeFit, GaussianWindow, fringe_fit
+from fpp_ml_bench.baselines.method import Answer
 from fpp_ml_bench.baselines.phase.method import FewestFrames, PhaseMethod, levels_of
 from fpp_ml_bench.baselines.phase.settings import steps_of
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.evaluation.submission.description import read_submission
-from fpp_ml_bench.evaluation.submission.prediction_files import REPORTS_FILE
-from fpp_ml_bench.loaders.render.illumination import light_surface
-from fpp_ml_bench.loaders.render.sensor import Exposure, camera_noise
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.optics.named_rigs import paper_rig
 
-SIZE = 480
-RIG = paper_rig(SIZE)
+SIZE = RIG.camera.width
 HALF = SIZE // 2
 OBJECT = (slice(110, 370), slice(130, 350))
 
@@ -39,24 +26,10 @@ def made(frames: int, direction: str = "horizontal", **options: object) -> Phase
 
 
 @cache
-def plane(
-    distance_m: float, direction: str = "horizontal", noise: float = 1.0
-) -> list[np.ndarray | None]:
+def plane(distance_m: float, direction: str = "horizontal") -> list[np.ndarray | None]:
     """All fringes and Gray frames of one direction on a plane that fills the frame."""
-    x, y = RIG.camera.rays()
-    points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * distance_m
-    light = PAPER.changed("camera", **camera_noise(noise))
-    exposure = Exposure.of(RIG, light)
-    lit = light_surface(
-        points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, light, exposure.pattern
-    )
     indices = [*RIG.sequence.sinusoids(direction), *RIG.sequence.gray(direction)]  # type: ignore[arg-type]
-    pixels = np.arange(x.size, dtype=np.uint32)
-    images = exposure.expose(indices, lit, pixels, (7, "plane", 0))
-    frames: list[np.ndarray | None] = [None] * len(RIG.sequence)
-    for index, image in zip(indices, images, strict=True):
-        frames[index] = image.reshape(x.shape)
-    return frames
+    return plane_frames(RIG, indices, plane_depth_m(RIG, distance_m))
 
 
 def scene(left_m: float, right_m: float) -> list[np.ndarray | None]:
@@ -109,40 +82,6 @@ def test_steps_are_spread_and_complete_each_other() -> None:
     for wrong in (0, 19, 2.5, True, "3"):
         with pytest.raises(PredictionError, match="1 to the 18"):
             steps_of(18, wrong)  # type: ignore[arg-type]
-
-
-def test_two_frames_solve_the_tied_fringe() -> None:
-    y, x = np.mgrid[:60, :60]
-    phase = (0.3 * y + 0.4 * np.sin(x / 15)).astype(np.float32)
-    bright = (40 + 0.1 * x).astype(np.float32)
-    shifts = (0.0, 2 * np.pi / 3)
-    greys = [(6 + bright * (1 + np.cos(phase + shift))).astype(np.float32) for shift in shifts]
-    start = phase + np.float32(0.35) * np.cos(x / 9).astype(np.float32)
-
-    def fitted(frames: int) -> FringeFit:
-        carrier = start
-        for _ in range(3):
-            fit = fringe_fit(
-                greys[:frames],
-                np.ones(phase.shape, bool),
-                carrier,
-                6.0,
-                GaussianWindow(1.5),
-                shifts[:frames],
-            )
-            carrier = fit.phase_rad
-        return fit
-
-    fit = fitted(2)
-    inner = (slice(6, -6), slice(6, -6))
-    assert (
-        np.abs(fit.phase_rad - phase)[inner].max() < 0.08
-    )  # where both are dark; a hundredth elsewhere
-    assert np.abs(fit.phase_rad - phase)[inner].mean() < 0.01
-    assert np.abs(fit.brightness - bright)[inner].mean() < 0.2
-    assert (
-        np.abs(fitted(1).phase_rad - phase)[inner].mean() > 0.1
-    )  # a window this small needs the second frame
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -260,31 +199,3 @@ def test_methods_say_what_they_need_and_refuse_what_they_cannot() -> None:
         made(3).measure([image if i != 6 else None for i, image in enumerate(plane(1.8))])
     with pytest.raises(DecodeError, match="expected 3 fringes"):
         made(3).route.measure(plane(1.8)[0])
-
-
-class Reporting(Method):
-    """A method that says how many frames each sample took."""
-
-    name, title, frames_used, reports = "counting", "Counting", (0,), True
-    settings: ClassVar = {"error_mm": 3.0}
-
-    def predict(self, frames):  # type: ignore[no-untyped-def]
-        return np.where(frames[0] > 128, 1800, 0).astype(np.float32)
-
-    def answer(self, frames):  # type: ignore[no-untyped-def]
-        return Answer(self.predict(frames), report={"frames": int(frames[0][0, 0]) % 3 + 1})
-
-    def summary(self, reports):  # type: ignore[no-untyped-def]
-        return {"frames_mean": sum(report["frames"] for report in reports) / len(reports)}
-
-
-def test_reports_lie_beside_the_predictions(tmp_path: Path) -> None:
-    dataset = make(tmp_path / "data", views=("A0", "A60"))
-    opened = DatasetFolder(dataset)
-    out = tmp_path / "out"
-    predict_split(opened, Reporting(opened.rig), "test", out)
-    reports = json.loads((out / REPORTS_FILE).read_text())
-    assert list(reports) == opened.samples("test")
-    mean = np.mean([report["frames"] for report in reports.values()])
-    assert read_submission(out).settings == {"error_mm": 3.0, "frames_mean": mean}
-    assert len(evaluate(out, opened, "test").per_sample) == 2

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from conftest import fpp_bench, refusal
 from flat_planes import (
     DIRECT,
     FIRST,
@@ -16,7 +18,9 @@ from flat_planes import (
     USERS_WORD,
     photograph,
     plane_depth_m,
+    plane_frames,
     plane_fringe,
+    turned,
 )
 
 from fpp_ml_bench.baselines.phase.depth import Reason
@@ -27,7 +31,6 @@ from fpp_ml_bench.baselines.phase.order import FringeOrder
 from fpp_ml_bench.baselines.phase.route import FringeRoute, one_carrier
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.evaluation.submission.description import read_submission
@@ -38,16 +41,7 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 SIZE = RIG.camera.width
-ANGLE = np.deg2rad(5.0)
-TURNED_RIG = replace(
-    RIG,
-    rotation=(
-        (np.cos(ANGLE), 0.0, np.sin(ANGLE)),
-        (0.0, 1.0, 0.0),
-        (-np.sin(ANGLE), 0.0, np.cos(ANGLE)),
-    ),
-    translation_m=(-0.02, -0.14, 0.03),
-)
+TURNED_RIG = turned(RIG, 5.0, (-0.02, -0.14, 0.03))
 
 
 @cache
@@ -56,8 +50,10 @@ def route(direction: str, rig: Rig = RIG, **options: object) -> FringeRoute:
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
-@pytest.mark.parametrize("distance_m", [1.52, 1.8, 2.08])
-@pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
+@pytest.mark.parametrize(
+    ("rig", "distance_m"),
+    [*product((RIG, OTHER_RIG), (1.52, 1.8, 2.08)), (TURNED_RIG, 1.8)],
+)
 def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: str) -> None:
     tilt = (0.1, -0.06)
     depth_m = plane_depth_m(
@@ -83,16 +79,17 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_fringes_with_a_crest_anywhere(frames: int, pitch_px: float) -> None:
     """Steps in another order, and an origin that is not pixel 0, tell the same depth."""
-    for shifts in ({"shifts_deg": [0, 120, 240]}, {"shifts_deg": [90, 210, 330], "origin_px": 7}):
+    for shifts in (
+        {"shifts_deg": [0, 120, 240]},
+        {"shifts_deg": [90, 210, 330], "origin_px": 7},
+        {"steps": 3, "sign": -1, "origin_px": 4.5},
+    ):
         code = {"scheme": "phase-shift", "pitch_px": pitch_px, **shifts}
         entries = {key: value for key, value in RIG.to_dict().items() if key != "pitch_px"}
         rig = rig_from_dict({**entries, "sequence": {"order": ["vertical"], "vertical": code}})
         exact_m = plane_depth_m(rig, 1.75, (0.1, 0.05))
         method = PhaseMethod(rig, direction="vertical", frames=frames, **USERS_WORD)
-        images: list[Any] = [None] * len(rig.sequence)
-        for number in method.frames_used:
-            images[number] = plane_fringe(rig, number, exact_m, (0.1, 0.05))
-        measurement = method.measure(images)
+        measurement = method.measure(plane_frames(rig, method.frames_used, exact_m, (0.1, 0.05)))
         lit = measurement.modulation_grey > 5
         assert lit.mean() > 0.7
         assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
@@ -122,10 +119,7 @@ def test_beyond_the_end_of_the_range_there_is_no_depth(rig: Rig, frames: int) ->
     exact_m = plane_depth_m(rig, 2.1, tilt)
     method = PhaseMethod(rig, frames=frames, **USERS_WORD)
     assert method.route.model.resampling.needed == (rig is not RIG)
-    images: list[Any] = [None] * len(rig.sequence)
-    for number in method.frames_used:
-        images[number] = plane_fringe(rig, number, exact_m, tilt)
-    measurement = method.measure(images)
+    measurement = method.measure(plane_frames(rig, method.frames_used, exact_m, tilt))
     depth_mm, exact_mm, lit = measurement.depth_mm, exact_m * 1000, measurement.modulation_grey > 5
     assert (depth_mm <= 2100).all() and (measurement.sigma_mm[depth_mm == 0] == 0).all()
     within, beyond = lit & (exact_mm < 2094), lit & (exact_mm > 2106)
@@ -133,16 +127,6 @@ def test_beyond_the_end_of_the_range_there_is_no_depth(rig: Rig, frames: int) ->
     assert (np.abs(depth_mm - exact_mm)[within] < 8).mean() > 0.99
     assert (depth_mm[beyond] == 0).mean() > 0.98
     assert (measurement.reason[beyond] == Reason.OUT_OF_RANGE).mean() > 0.98
-
-
-def test_a_projector_that_is_turned_and_ahead() -> None:
-    exact_m = plane_depth_m(TURNED_RIG, 1.7, (0.1, 0.3))
-    measurement = route("horizontal", TURNED_RIG, **USERS_WORD).measure(
-        plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3))
-    )
-    lit = measurement.modulation_grey > 5
-    assert lit.mean() > 0.7
-    assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
 
 
 def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
@@ -322,39 +306,22 @@ def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
     assert np.median(np.abs(measurement.depth_mm - 1800)[lit]) < 1
 
 
-def test_method_is_registered_and_reports_itself() -> None:
-    phase_method = load_method("phase", RIG, direction="vertical", prior="standoff")
-    assert phase_method.frames_used == (18,)
-    assert phase_method.uses_ground_truth_range is False
-    assert phase_method.settings["prior"] == "standoff" and "standoff" in phase_method.title
-    frames: list = [None] * 52
-    frames[18] = photograph("cork", "A60").frames[18]
-    depth_mm = phase_method.predict(frames)
-    assert depth_mm.dtype == np.float32 and depth_mm.shape == (SIZE, SIZE)
-
-
-def test_the_users_word_from_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    dataset = str(tmp_path / "set")
-    build(Path(dataset), BuildSettings(RIG, ("cork",), stored="single_shot"), workers=1)
-    word = ["--white-grey", "180", "--ambient-grey", "0"]
-    out = tmp_path / "phase"
-    assert main(["predict", "phase", dataset, "--out", str(out), "--split", "all", *word]) == 0
-    settings = read_submission(out).settings
-    assert (settings["white_grey"], settings["ambient_grey"]) == (180.0, 0.0)
-    for arguments, message in (
-        (["phase", dataset, "--white-grey", "-1"], "white_grey -1.0: expected more than 0"),
-        (["phase", dataset, "--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
-        (
-            ["classical", dataset, "--ambient-grey", "6"],
-            "--ambient-grey is an option of phase, not of classical",
-        ),
+def test_the_users_word_from_the_command_line(tmp_path: Path) -> None:
+    dataset, out, mask = tmp_path / "set", tmp_path / "phase", tmp_path / "mask.png"
+    build(dataset, BuildSettings(RIG, ("cork",), stored="single_shot"), workers=1)
+    cv2.imwrite(str(mask), np.full((SIZE, SIZE), 255, np.uint8))
+    words = ["predict", "phase", dataset, "--split", "all", "--mask", mask, "--prior", "standoff"]
+    words += ["--white-grey", "180", "--ambient-grey", "0"]
+    assert fpp_bench(*words, "--out", out) == 0
+    told = read_submission(out)
+    assert told.settings | {"white_grey": 180.0, "ambient_grey": 0.0} == told.settings
+    assert told.settings["mask"] == "mask.png" and "standoff" in told.name
+    for word, message in (
+        (["--white-grey", "-1"], "white_grey -1.0: expected more than 0"),
+        (["--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
     ):
-        capsys.readouterr()
-        assert main(["predict", *arguments, "--out", str(tmp_path / "wrong")]) == 2
-        assert message in capsys.readouterr().err
-        assert not (tmp_path / "wrong").exists()
+        error = refusal(fpp_bench, "predict", "phase", dataset, *word, "--out", tmp_path / "wrong")
+        assert message in error and not (tmp_path / "wrong").exists()
 
 
 def test_refusals_name_what_came() -> None:

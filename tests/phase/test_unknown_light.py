@@ -1,30 +1,25 @@
 """Images that show no known background: fringes of any contrast on surfaces of any brightness, and
 of any period."""
 
-import copy
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from crossed_scenes import noisy
 from flat_planes import RIG, photograph, plane_depth_m, plane_fringe
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase import geometry
 from fpp_ml_bench.baselines.phase.depth import Reason
-from fpp_ml_bench.baselines.phase.method import PhaseMethod
 from fpp_ml_bench.baselines.phase.observe import OneCarrier
 from fpp_ml_bench.baselines.phase.route import one_carrier
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.loaders.render.builder import build
-from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 SMALL = paper_rig(240)
 NARROW = replace(SMALL, working_range_mm=(1600.0, 2000.0))
@@ -49,8 +44,7 @@ def in_the_dark(
     fringe = mean * (1 + contrast * np.cos(2 * np.pi * coordinate / rig.pitch(direction)))  # type: ignore[arg-type]
     grey = np.where(disk, fringe, 0.0) + 2
     grey[: height // 6, : width // 6] = 60
-    noise = np.random.default_rng(1).normal(0, 1, grey.shape)
-    return np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8), disk
+    return noisy(grey, 1.0, seed=1), disk
 
 
 def bowl(rig: Rig, nearest_m: float, farthest_m: float) -> NDArray[np.float64]:
@@ -81,25 +75,8 @@ def test_range_and_continuity_settle_the_order_of_a_surface_that_fills_the_range
     assert (error < 3 * measurement.sigma_mm)[settled].mean() > 0.9
 
 
-@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
-@pytest.mark.parametrize("frames", [1, 2, 3])
-def test_where_two_orders_fit_the_range_there_is_no_depth(frames: int, direction: str) -> None:
-    model = OneCarrier(SMALL, Settings(direction, frames=frames))  # type: ignore[arg-type]
-    depth_m = plane_depth_m(SMALL, 1.8)
-    images = [
-        plane_fringe(SMALL, (18 if direction == "vertical" else 0) + step, depth_m)
-        for step in model.steps
-    ]
-    measurement = one_carrier(model).measure(images)
-    several = (measurement.candidates.count > 1) & (measurement.modulation_grey > 5)
-    assert several.mean() > 0.5
-    assert (measurement.depth_mm[several] == 0).mean() > 0.95
-    assert (measurement.reason[several] != Reason.MEASURED).all()
-
-
 def test_no_known_background_is_one_that_is_not_in_view() -> None:
-    rig = copy.copy(NARROW)
-    object.__setattr__(rig, "background_m", None)
+    rig = replace(NARROW, background_m=None)
     image, _ = in_the_dark(NARROW, bowl(NARROW, 1.62, 1.97))
     unknown, unseen = (
         one_carrier(OneCarrier(some, Settings("vertical"))).measure(image) for some in (rig, NARROW)
@@ -110,23 +87,15 @@ def test_no_known_background_is_one_that_is_not_in_view() -> None:
 
 def test_a_dim_texture_is_not_taken_for_the_background() -> None:
     x, y = SMALL.camera.rays()
-    grey = (
-        3
-        + 1.5 * np.cos(2 * np.pi * 95 * (x + 0.4 * y))
-        + np.random.default_rng(0).normal(0, 0.6, x.shape)
-    )
-    measurement = one_carrier(OneCarrier(SMALL)).measure(
-        np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-    )
+    grey = 3 + 1.5 * np.cos(2 * np.pi * 95 * (x + 0.4 * y))
+    measurement = one_carrier(OneCarrier(SMALL)).measure(noisy(grey, 0.6, seed=0))
     assert measurement.background_share == 0
     assert not measurement.depth_mm.any()
 
 
 def test_long_periods_are_measured_on_a_smaller_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    row = photograph(
-        "cracker_box", "A60", replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
-    )
     rig = replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
+    row = photograph("cracker_box", "A60", rig)
     assert rig.image_px_per_period("horizontal") > 60
     errors = []
     for longest_px in (geometry.LONGEST_PX, 1e9):  # resampled, and not
@@ -172,10 +141,13 @@ def test_what_comes_back_is_interpolated_but_not_across_a_jump(
     assert not one_carrier(OneCarrier(LONG)).measure(empty).depth_mm.any()
 
 
-def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mask_of_the_user(tmp_path: Path) -> None:
+    def png(mask: NDArray[np.bool_]) -> bytes:
+        return cv2.imencode(".png", mask * np.uint8(255))[1].tobytes()
+
     image, disk = in_the_dark(NARROW, bowl(NARROW, 1.62, 1.97))
     file = tmp_path / "mask.png"
-    cv2.imwrite(str(file), disk.astype(np.uint8) * 255)
+    file.write_bytes(png(disk))
     method = load_method("phase", NARROW, direction="vertical", mask=file)
     assert method.settings["mask"] == "mask.png"
     depth_mm = method.predict([None] * 18 + [image])
@@ -183,76 +155,10 @@ def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     for name, content, message in (
         ("absent.png", None, "found nothing there"),
         ("text.png", b"no image", "text.png: .*capture or copy it again"),
-        (
-            "small.png",
-            cv2.imencode(".png", np.ones((3, 4), np.uint8))[1].tobytes(),
-            r"got \(3, 4\)",
-        ),
-        (
-            "empty.png",
-            cv2.imencode(".png", np.zeros((240, 240), np.uint8))[1].tobytes(),
-            "shows no object",
-        ),
+        ("small.png", png(disk[:3, :4]), r"got \(3, 4\)"),
+        ("empty.png", png(disk & ~disk), "shows no object"),
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
         with pytest.raises(CaptureError, match=message):
             load_method("phase", NARROW, mask=tmp_path / name)
-    dataset = str(tmp_path / "set")
-    build(Path(dataset), BuildSettings(SMALL, ("cork",), stored="single_shot"), workers=1)
-    command = [
-        "predict",
-        "phase",
-        dataset,
-        "--split",
-        "all",
-        "--mask",
-        str(file),
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert main(command) == 0
-    capsys.readouterr()
-    assert (
-        main(
-            ["predict", "classical", dataset, "--mask", str(file), "--out", str(tmp_path / "wrong")]
-        )
-        == 2
-    )
-    assert "--mask is an option of phase" in capsys.readouterr().err
-
-
-def test_shifts_of_any_code_are_those_that_the_route_expects() -> None:
-    """A code with its own origin and sign gives the depth that the paper's kind gives, from the
-    same light."""
-    data = paper_rig(200).to_dict()
-    del data["pitch_px"]
-    code = {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": -1, "origin_px": 4.5}
-    rig = rig_from_dict(
-        {
-            **data,
-            "sequence": {"vertical": code},
-            "working_range_mm": [1600, 1800],
-            "standoff_m": 1.7,
-        }
-    )
-    assert np.allclose(
-        rig.shifts_rad("vertical"),
-        [-np.pi / 2, -np.pi / 2 - 2 * np.pi / 3, -np.pi / 2 - 4 * np.pi / 3],
-    )
-    x, y = rig.camera.rays()
-    u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * 1.7)
-    frames = [
-        np.rint(np.nan_to_num(100 + 80 * np.cos(2 * np.pi * u_px / 18 + shift), nan=100)).astype(
-            np.uint8
-        )
-        for shift in rig.shifts_rad("vertical")
-    ]
-    profile = rig.code("vertical").profiles(912)[1].astype(float)
-    lit = (u_px > 0) & (u_px < 911)
-    assert (
-        np.abs(np.interp(u_px, np.arange(912), profile) * 80 / 127.5 + 20 - frames[1])[lit].max()
-        < 2
-    )
-    measurement = PhaseMethod(rig, direction="vertical", frames=3).measure(frames)
-    assert np.median(np.abs(measurement.depth_mm[measurement.depth_mm > 0] - 1700)) < 2

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from conftest import fpp_bench, fpp_eval, printed, read_json, refusal
 from scored_dataset import write_description
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
@@ -30,8 +31,6 @@ from fpp_ml_bench.baselines.training.engine import claim_folder
 from fpp_ml_bench.baselines.training.recipe import load_recipe
 from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.baselines.trivial import best_range_share
-from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
 from fpp_ml_bench.evaluation.result.file import read_result, write_json
 from fpp_ml_bench.evaluation.score.check import Rules
@@ -130,18 +129,8 @@ def unscored(monkeypatch):
 @pytest.fixture
 def run(tiny, tmp_path, trainer):
     """Run the command on the tiny dataset below ``tmp_path``."""
-    return lambda *words: main(
-        [
-            "reproduce",
-            words[0],
-            str(tiny),
-            *map(str, words[1:]),
-            "--out",
-            str(tmp_path / "runs"),
-            "--workers",
-            "1",
-        ]
-    )
+    options = ["--out", tmp_path / "runs", "--workers", 1]
+    return lambda table, *words: fpp_bench("reproduce", table, tiny, *words, *options)
 
 
 def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
@@ -165,8 +154,8 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
             p.numel() for p in build("unet", width=1).parameters()
         )
         for folder in ("results", "rows"):
-            files = str(below / folder / f"{name}.json"), str(below / "predictions" / name)
-            assert fpp_eval(["verify", *files, str(tiny)]) == 0
+            files = below / folder / f"{name}.json", below / "predictions" / name
+            assert fpp_eval("verify", *files, tiny) == 0
     text = (below / f"{TABLE}.md").read_text()
     lines = {
         line.split(" | ")[0].strip("| "): line
@@ -206,9 +195,12 @@ def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
 def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_path):
     assert run(TABLE) == 0
     below = tmp_path / "runs" / "small"
-    weights_before = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings[
-        "weights_sha256"
-    ]
+
+    def weights():
+        row = read_entry(below / "rows" / f"{NAMES[2]}.json").row
+        return row.submission.settings["weights_sha256"]
+
+    weights_before = weights()
     (below / "unet-individual-rmse" / "done.json").unlink()
     trainer.says["unet-individual-rmse"] = "out of time"
     trainer.seed = 1
@@ -216,19 +208,12 @@ def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_pa
     assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
     trainer.says.clear()
     assert run(TABLE, "--only-missing") == 0
-    weights_after = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings[
-        "weights_sha256"
-    ]
-    assert weights_before != weights_after and len(trainer.trained) == 10
+    assert weights_before != weights() and len(trainer.trained) == 10
 
 
 def test_rows_of_another_machine_are_shown_if_of_the_same_recipe(run, trainer, tmp_path):
     def lines():
-        return [
-            line
-            for line in (below / f"{TABLE}.md").read_text().splitlines()
-            if line.startswith("| individual |")
-        ]
+        return re.findall(r"^\| individual \|.*", (below / f"{TABLE}.md").read_text(), re.M)
 
     below = tmp_path / "runs" / "small"
     assert run(TABLE) == 0
@@ -302,7 +287,7 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
 def test_a_training_on_another_dataset_is_refused(run, trainer, unscored, tmp_path, capsys):
     assert run(TABLE) == 0 and run(TABLE) == 0
     path = tmp_path / "runs" / "small" / "unet-individual-rmse" / "recipe.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"fingerprint": 64 * "a"}))
+    path.write_text(json.dumps(read_json(path) | {"fingerprint": 64 * "a"}))
     assert run(TABLE) == 2
     assert (
         "is of aaaaaaaa; give that dataset as DATASET, or another --out" in capsys.readouterr().err
@@ -434,13 +419,8 @@ def test_every_object_is_left_out_once(run, trainer, tmp_path, opened):
     assert "| oracle range |" in line
     # A table that the paper does not have.
     assert run("further/plain", "--folds", "3") == 0
-    assert "| metric |" in next(
-        text
-        for text in (below / "folds.md").read_text().splitlines()
-        if text.startswith("| further/plain")
-    )
-    trained_on = json.loads((below / names[1] / "recipe.json").read_text())["recipe"]["fold"]
-    assert trained_on == [1, 3]
+    assert re.search(r"^\| further/plain.*\| metric \|", (below / "folds.md").read_text(), re.M)
+    assert read_json(below / names[1] / "recipe.json")["recipe"]["fold"] == [1, 3]
 
 
 def test_the_best_constant_is_best(opened):
@@ -472,23 +452,19 @@ def test_time_left_of_a_plan(tmp_path):
     assert plan_state(recipes, folders) == (3 + epochs, 2.0 * (2 * epochs - 3))
 
 
-def test_list_and_help_do_not_train(run, trainer, capsys, tmp_path, monkeypatch):
+def test_list_and_help_do_not_train(trainer, tmp_path, monkeypatch):
     monkeypatch.setattr("fpp_ml_bench.cli.train.SHIPPED_ROWS", tmp_path / "none")
-    assert main(["reproduce", "--list"]) == 0
-    listed = capsys.readouterr().out
+    listed = printed(fpp_bench, "reproduce", "--list")
     assert "34 trainings fill 30 rows; the rows of 0 trainings come with the package" in listed
     assert "Those of the other 34 are not measured yet: a training takes" in listed
-    assert main(["reproduce"]) == 2
-    assert "expected a table" in capsys.readouterr().err
-    for table, problem in (
-        ("nonsense", "expected a table"),
-        ("loss/l2", "no row 'l2'"),
-        ("loss/", "no row ''"),
+    for words, problem in (
+        ([], "expected a table"),
+        (["nonsense"], "expected a table"),
+        (["loss/l2"], "no row 'l2'"),
+        (["loss/"], "no row ''"),
+        ([TABLE, "--minutes", "nan"], "expected minutes above 0"),
     ):
-        assert main(["reproduce", table]) == 2
-        assert problem in capsys.readouterr().err
-    assert main(["reproduce", TABLE, "--minutes", "nan"]) == 2
-    assert "expected minutes above 0" in capsys.readouterr().err
+        assert problem in refusal(fpp_bench, "reproduce", *words)
     assert trainer.trained == []
 
 
@@ -496,10 +472,10 @@ def test_rows_of_another_dataset_are_not_overwritten(run, tmp_path, tiny, capsys
     assert run(TABLE) == 0
     rows = tmp_path / "runs" / "small" / "rows"
     path = rows / f"{NAMES[0]}.json"
-    content = json.loads(path.read_text())
+    content = read_json(path)
     others = dict.fromkeys(content["dataset"]["content"], 32 * "b")
     content["dataset"]["content"] = others
     path.write_text(json.dumps(content))
     assert run(TABLE) == 2
     assert "is a row on other data (no named benchmark" in capsys.readouterr().err
-    assert json.loads(path.read_text())["dataset"]["content"] == others
+    assert read_json(path)["dataset"]["content"] == others

@@ -6,8 +6,7 @@ from statistics import fmean
 from types import SimpleNamespace
 
 import pytest
-from board_rows import HARDWARE
-from scored_dataset import make_dataset, write_predictions
+from scored_dataset import HARDWARE, make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.reproduce import plan
 from fpp_ml_bench.baselines.reproduce.plan import Folders, default_folder, open_dataset, planned

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from board_rows import write_result_file
 from conftest import fpp_eval, read_json, refusal, tiny_settings
 from scored_dataset import make_dataset, name_benchmarks, write_predictions
 
@@ -38,13 +39,9 @@ def named(dataset, tmp_path, monkeypatch):
     return dataset
 
 
-def result_file(dataset, folder):
-    """A result of predictions with noise, written to a file in ``folder``."""
-    folder.mkdir(exist_ok=True)
-    predictions = write_predictions(folder / "predictions", dataset, noise_mm=2.0)
-    path = folder / "result.json"
-    write_result(evaluate(predictions, dataset), path)
-    return path
+def scored_file(dataset, folder, name="p"):
+    """A result of predictions with noise."""
+    return write_result_file(folder / f"{name}.json", dataset, 0.0, 2.0)
 
 
 def change_dataset(path, **changes):
@@ -58,22 +55,27 @@ def change_dataset(path, **changes):
 
 
 def test_a_result_on_a_benchmark_says_its_name_and_version(named, tmp_path, capsys):
-    path = result_file(named, tmp_path)
+    path = scored_file(named, tmp_path)
     assert read_json(path)["dataset"]["benchmark"] == {"name": "tiny-bench", "version": 4}
     assert result_json(read_result(path)) == path.read_bytes()
-    command = [str(tmp_path / "predictions"), str(named.path), "--report", str(tmp_path / "report")]
+    command = [
+        str(tmp_path / "p-predictions"),
+        str(named.path),
+        "--report",
+        str(tmp_path / "report"),
+    ]
     assert fpp_eval(*command) == 0
     printed = capsys.readouterr()
     truth = read_result(path).dataset.truth
     assert f"(tiny-bench version 4, content {truth[:8]})" in printed.out and printed.err == ""
     assert "tiny-bench version 4" in (tmp_path / "report" / "index.html").read_text()
-    assert fpp_eval("verify", path, tmp_path / "predictions", named.path) == 0
+    assert fpp_eval("verify", path, tmp_path / "p-predictions", named.path) == 0
 
 
 def test_a_result_on_any_other_dataset_has_no_such_key(dataset, tmp_path, capsys):
-    path = result_file(dataset, tmp_path)
+    path = scored_file(dataset, tmp_path)
     assert "benchmark" not in read_json(path)["dataset"]
-    assert fpp_eval(tmp_path / "predictions", dataset.path) == 0
+    assert fpp_eval(tmp_path / "p-predictions", dataset.path) == 0
     printed = capsys.readouterr()
     truth = read_result(path).dataset.truth
     assert f"(no named benchmark, content {truth[:8]})" in printed.out and printed.err == ""
@@ -122,7 +124,7 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(
     ],
 )
 def test_a_claim_that_contradicts_the_content_is_refused(changes, message, named, tmp_path):
-    path = result_file(named, tmp_path)
+    path = scored_file(named, tmp_path)
     change_dataset(path, **changes)
     if message is None:
         assert read_result(path).dataset.benchmark is None
@@ -132,14 +134,14 @@ def test_a_claim_that_contradicts_the_content_is_refused(changes, message, named
 
 
 def test_compare_and_verify_name_both(named, dataset, tmp_path, capsys):
-    path, other = result_file(named, tmp_path), result_file(named, tmp_path / "else")
+    path, other = scored_file(named, tmp_path), scored_file(named, tmp_path, "else")
     change_dataset(other, content=OTHER, benchmark=None)
     assert fpp_eval("compare", path, other) == 2
     first, second = (read_result(file).dataset.identity for file in (path, other))
     assert f"dataset: {first} against {second}" in capsys.readouterr().err and first.startswith(
         "tiny-bench version 4"
     )
-    assert fpp_eval("verify", other, tmp_path / "predictions", named.path) == 1
+    assert fpp_eval("verify", other, tmp_path / "p-predictions", named.path) == 1
     printed = capsys.readouterr().out
     assert (
         "dataset.content.test/depth: " + "e" * 32 in printed
@@ -150,7 +152,7 @@ def test_compare_and_verify_name_both(named, dataset, tmp_path, capsys):
 def test_other_counts_of_a_named_benchmark_are_refused(named, tmp_path, monkeypatch):
     """Pixels moved from the object to void, an object left out, one counted twice, an invented one:
     all averages are made again, so the file agrees with itself."""
-    path = result_file(named, tmp_path)
+    path = scored_file(named, tmp_path)
     scored = read_result(path)
     rows = [row.model_dump() for row in scored.per_sample]
     fields = {

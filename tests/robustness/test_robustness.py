@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import fpp_bench, printed, refusal
 
 from fpp_ml_bench.baselines.learned.scenes import HELD_OUT, drawn_light
 from fpp_ml_bench.baselines.method import Answer, Method, checked
@@ -23,7 +24,6 @@ from fpp_ml_bench.baselines.robustness.axes import (
 )
 from fpp_ml_bench.baselines.robustness.run import Setup, measure, robustness, write_page
 from fpp_ml_bench.baselines.trivial import ConstantMethod
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.parts import Robustness
@@ -35,7 +35,8 @@ pytestmark = pytest.mark.long
 SIZE, OBJECT = 176, "v_groove"
 ONE_FRAME = (0,)
 RULES = corruptions()
-CHARGE_MM = paper_rig(SIZE).half_range_mm
+RIG = paper_rig(SIZE)
+CHARGE_MM = RIG.half_range_mm
 
 
 @pytest.fixture(autouse=True)
@@ -136,7 +137,7 @@ def test_a_moving_object_rests_halfway_through_its_frames():
 
 
 def test_motion_is_nothing_to_one_frame_and_interreflection_to_convex_objects():
-    setup = Setup(Noisy(paper_rig(SIZE)), "test", SIZE)
+    setup = Setup(Noisy(RIG), "test", SIZE)
     assert "motion" not in setup.axes(()) and "interreflection" in setup.axes(())
     assert not RULES.axes["interreflection"].applies(("power_drill",), 1)
 
@@ -145,6 +146,10 @@ def truth() -> Truth:
     depth = np.zeros((SIZE, SIZE), dtype=np.float32)
     depth[20:60, 20:60] = 1700
     return Truth(depth, depth > 0, depth == 0)
+
+
+def scored(depth_mm, sigma_mm=None):
+    return score(depth_mm, sigma_mm, truth(), RULES, CHARGE_MM)
 
 
 def test_two_axes_are_held_out_of_all_drawn_lights_and_the_rest_is_named():
@@ -160,17 +165,17 @@ def test_what_a_training_drew_is_said_by_its_recipe():
     class Learned(Noisy):
         weights_config = SimpleNamespace(recipe={"held_out": []})
 
-    before = Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn
+    before = Setup(Learned(RIG), "test", SIZE).drawn
     assert "camera-blur" in before and "dark-paint" not in before and "motion" not in before
     Learned.weights_config.recipe["held_out"] = list(HELD_OUT)
-    assert Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn == [
+    assert Setup(Learned(RIG), "test", SIZE).drawn == [
         name for name in before if name != "camera-blur"
     ]
-    assert Setup(Noisy(paper_rig(SIZE)), "test", SIZE).drawn == []
+    assert Setup(Noisy(RIG), "test", SIZE).drawn == []
 
 
 def test_silence_costs_half_the_working_range():
-    scores = score(np.zeros((SIZE, SIZE)), None, truth(), RULES, CHARGE_MM)
+    scores = scored(np.zeros((SIZE, SIZE)))
     assert scores["mae_mm"] == CHARGE_MM == 300
     assert (
         scores["unanswered_share"] == 1
@@ -184,7 +189,7 @@ def test_missed_invented_and_the_error_of_what_is_answered_are_told_apart():
     depth[20:30, 20:60] = 0  # a quarter of the object
     depth[~true.scored] = 0
     depth[:10] = 1500  # an eighth of the image
-    scores = score(depth, None, true, RULES, CHARGE_MM)
+    scores = scored(depth)
     assert scores["unanswered_share"] == 0.25 and scores["answered_mae_mm"] == pytest.approx(3)
     assert scores["invented_share"] == pytest.approx(10 * SIZE / 40**2)
     assert scores["mae_mm"] == pytest.approx((0.25 + 10 * SIZE / 40**2) * CHARGE_MM + 0.75 * 3)
@@ -192,22 +197,22 @@ def test_missed_invented_and_the_error_of_what_is_answered_are_told_apart():
 
 def test_a_right_answer_is_better_than_silence_and_silence_than_an_error_above_the_charge():
     right, wrong = (truth().depth_mm + error_mm * truth().scored for error_mm in (3, 400))
-    assert score(right, None, truth(), RULES, CHARGE_MM)["mae_mm"] == pytest.approx(3)
-    assert score(wrong, None, truth(), RULES, CHARGE_MM)["mae_mm"] == pytest.approx(400)
-    assert score(wrong, None, truth(), RULES, CHARGE_MM)["wrong_share"] == 1
+    assert scored(right)["mae_mm"] == pytest.approx(3)
+    assert scored(wrong)["mae_mm"] == pytest.approx(400)
+    assert scored(wrong)["wrong_share"] == 1
 
 
 @pytest.mark.parametrize(("sigma_mm", "share"), [(74.0, 1.0), (76.0, 0.0)])
 def test_a_lie_about_sigma_is_a_confident_error(sigma_mm, share):
     sigma = np.full((SIZE, SIZE), sigma_mm)
-    scores = score(truth().depth_mm + 300, sigma, truth(), RULES, CHARGE_MM)
+    scores = scored(truth().depth_mm + 300, sigma)
     assert scores["confident_share"] == share and scores["coverage"] == 1
-    honest = score(truth().depth_mm + 20, sigma, truth(), RULES, CHARGE_MM)
+    honest = scored(truth().depth_mm + 20, sigma)
     assert honest["confident_share"] == 0
 
 
 def test_stating_no_sigma_at_all_is_no_coverage():
-    scores = score(truth().depth_mm + 300, np.zeros((SIZE, SIZE)), truth(), RULES, CHARGE_MM)
+    scores = scored(truth().depth_mm + 300, np.zeros((SIZE, SIZE)))
     assert scores["confident_share"] == 0 and scores["coverage"] == 0
 
 
@@ -228,11 +233,11 @@ def test_no_number_is_refused():
 
 def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
     chosen = ["ambient-light"]
-    random, silent, liar = Noisy(paper_rig(SIZE)), Noisy(paper_rig(SIZE)), Noisy(paper_rig(SIZE))
+    random, silent, liar = Noisy(RIG), Noisy(RIG), Noisy(RIG)
     random.noise_mm, silent.silent, liar.sigma_mm = 400.0, True, 1.0
     liar.noise_mm = 400.0
     means = {}
-    for number, method in enumerate((random, silent, liar, ConstantMethod(paper_rig(SIZE)))):
+    for number, method in enumerate((random, silent, liar, ConstantMethod(RIG))):
         rows = measure(Setup(method, "test", SIZE, quick=True), tmp_path / str(number), chosen)
         assert set(rows) == {CLEAN, *chosen} and len(rows[chosen[0]]) == 3
         means[number] = rows[chosen[0]][0]
@@ -245,19 +250,19 @@ def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
 
 
 def test_measuring_resumes_axis_by_axis_and_refuses_another_methods_folder(tmp_path, monkeypatch):
-    setup = Setup(Noisy(paper_rig(SIZE)), "test", SIZE, quick=True)
+    setup = Setup(Noisy(RIG), "test", SIZE, quick=True)
     first = measure(setup, tmp_path, ["ambient-light"])
     monkeypatch.setattr(Noisy, "answer", None)  # nothing is left to do
     assert measure(setup, tmp_path, ["ambient-light"]) == first
     with pytest.raises(PredictionError, match="other quick"):
-        measure(Setup(Noisy(paper_rig(SIZE)), "test", SIZE), tmp_path, ["ambient-light"])
+        measure(Setup(Noisy(RIG), "test", SIZE), tmp_path, ["ambient-light"])
     (tmp_path / "clean.json").write_text('{"views": 3}')
     with pytest.raises(PredictionError, match=r"clean\.json: damaged"):
         measure(setup, tmp_path, ["ambient-light"])
 
 
 def test_processes_and_a_cluster_give_the_same_rows_as_one(tmp_path, fake_ray):
-    setup = Setup(ConstantMethod(paper_rig(SIZE)), "test", SIZE, quick=True)
+    setup = Setup(ConstantMethod(RIG), "test", SIZE, quick=True)
     one, two = (measure(setup, tmp_path / str(n), ["ambient-light"], workers=n) for n in (1, 2))
     saved = []
     three = measure(
@@ -318,7 +323,7 @@ def rows_of(axes_maes: dict[str, list[list[float]]]):
 
 
 def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_objects(monkeypatch):
-    setup = Setup(Noisy(paper_rig(SIZE)), "test", SIZE)
+    setup = Setup(Noisy(RIG), "test", SIZE)
     monkeypatch.setattr(Setup, "axes", lambda self, names: [CLEAN, "gloss", "interreflection"])
     rows = rows_of(
         {
@@ -346,7 +351,7 @@ def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_o
 
 
 def test_a_normalised_answer_and_an_unknown_axis_are_refused():
-    method = Noisy(paper_rig(SIZE))
+    method = Noisy(RIG)
     method.units = "normalised"
     with pytest.raises(PredictionError, match="networks of raw or global normalisation"):
         Setup(method, "test", SIZE)
@@ -355,13 +360,13 @@ def test_a_normalised_answer_and_an_unknown_axis_are_refused():
     assert axes.FILE.is_file()
 
 
-def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
+def test_the_command_measures_draws_and_says_where(tmp_path):
     out, cache = tmp_path / "out", tmp_path / "cache"
-    words = ["--quick", "--size", str(SIZE), "--axes", "read-noise", "--workers", "1"]
-    words += ["--out", str(out), "--cache", str(cache)]
-    assert main(["robustness", "constant", "--at", "training-mean", *words]) == 0
-    assert "Constant depth: training-mean" in capsys.readouterr().out
-    assert main(["robustness", "constant", "--at", "1700", *words]) == 0
+    words = ["--quick", "--size", SIZE, "--axes", "read-noise", "--workers", 1]
+    words += ["--out", out, "--cache", cache]
+    said = printed(fpp_bench, "robustness", "constant", "--at", "training-mean", *words)
+    assert "Constant depth: training-mean" in said
+    assert fpp_bench("robustness", "constant", "--at", "1700", *words) == 0
     page = (out / "index.html").read_text(encoding="utf-8")
     assert (
         "Constant depth, 1700 mm" in page
@@ -372,51 +377,14 @@ def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
     (method,) = (json.loads(file.read_text()) for file in out.glob("*mean*/read-noise.json"))
     assert [row["severity"] for row in method["views"]] == [1, 3, 5]
     assert write_page(out) == out / "index.html"
+    assert "--into: needs all axes" in refusal(
+        fpp_bench, "robustness", "constant", *words, "--into", "x.json"
+    )
 
 
 def test_the_scenes_show_the_fringes_that_an_option_asks_for(tmp_path):
-    words = [
-        "--fringes",
-        "crossed",
-        "--members",
-        "1",
-        "--size",
-        "256",
-        "--quick",
-        "--axes",
-        "gloss",
-    ]
-    assert (
-        main(
-            [
-                "robustness",
-                "fringe-net",
-                *words,
-                "--out",
-                str(tmp_path),
-                "--no-cache",
-                "--workers",
-                "1",
-            ]
-        )
-        == 0
-    )
+    words = "fringe-net --fringes crossed --members 1 --size 256 --quick --axes gloss --no-cache"
+    assert fpp_bench("robustness", *words.split(), "--workers", 1, "--out", tmp_path) == 0
     (file,) = tmp_path.glob("*/clean.json")
     (row,) = json.loads(file.read_text())["views"]
     assert row["answered_mae_mm"] < 5
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["constant", "--at", "nowhere"], "at 'nowhere': expected standoff"),
-        (
-            ["constant", "--steps", "3"],
-            "--steps is an option of classical, not of constant",
-        ),
-        (["constant", "--quick", "--into", "x.json"], "--into: needs all axes"),
-    ],
-)
-def test_bad_input_is_a_sentence_and_nothing_is_written(tmp_path, capsys, words, said):
-    assert main(["robustness", *words, "--size", str(SIZE), "--out", str(tmp_path / "out")]) == 2
-    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from conftest import fpp_eval, printed, read_json, refusal
 from scipy import stats
-from scored_dataset import change_json, make_dataset, write_predictions
+from scored_dataset import write_predictions
 
-from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.report.comparison import compare
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
@@ -26,13 +25,6 @@ def make(tmp_path, dataset):
         return path
 
     return write
-
-
-@pytest.mark.parametrize("freedom", [1, 2, 5, 49])
-def test_student_quantile_is_scipys(freedom):
-    assert uncertainty._student_quantile(0.975, freedom) == pytest.approx(
-        stats.t.ppf(0.975, freedom), rel=1e-9
-    )
 
 
 def test_interval_is_the_expanded_percentile_of_resampled_objects():
@@ -56,19 +48,6 @@ def test_interval_is_the_expanded_percentile_of_resampled_objects():
     assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.03)
     assert low < values.mean() < high
     assert object_interval(values.tolist(), objects.tolist()) == (low, high)
-
-
-def test_interval_covers_the_truth_about_as_often_as_it_says():
-    """Five objects of six correlated views each, as in the test split; the plain percentile
-    interval covers 84%."""
-    rng = np.random.default_rng(7)
-    objects = np.repeat(np.arange(5), 6).tolist()
-    covered = 0
-    for _ in range(200):
-        values = (rng.normal(0, 1, 5)[objects] + rng.normal(0, 0.3, 30)).tolist()
-        low, high = object_interval(values, objects)
-        covered += low <= 0 <= high
-    assert 0.87 <= covered / 200 <= 0.99
 
 
 def test_unequal_views_weigh_samples_alike_and_gaps_are_left_out():
@@ -183,41 +162,6 @@ def test_one_object_has_no_interval(dataset, tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    "path, value, message",
-    [
-        ("intervals.object_mae_mm.0", 0.5, r"intervals\.object_mae_mm\.0 does not follow"),
-        (
-            "per_object.0.metrics.object_mae_mm",
-            0.5,
-            r"per_object\.0\.metrics\.object_mae_mm does not follow",
-        ),
-        (
-            "per_object.0.spread.object_mae_mm",
-            0.5,
-            r"per_object\.0\.spread\.object_mae_mm does not follow",
-        ),
-        ("seeds.bootstrap", 1, r"seeds\.bootstrap does not follow"),
-        ("bootstrap.resamples", 10, r"bootstrap\.resamples does not follow"),
-        ("per_sample.0.object_bias_mm", -99.0, "bias or shift-free MAE is above the MAE"),
-        ("per_sample.0.object_median_mm", 99.0, "out of order"),
-        ("per_sample.0.object_p95_mm", None, "null all together"),
-        ("mode", "paper", r"dataset\.content: expected hashes of test/depth, got"),
-        (
-            "target",
-            "depth_exact",
-            r"dataset\.content: expected hashes of test/depth_exact, test/flags",
-        ),
-        ("environment.code_sha256", "x", "code_sha256"),
-    ],
-)
-def test_edited_result_contradicts_itself(path, value, message, make):
-    file = make("a", noise_mm=2.0)
-    change_json(file, path, value)
-    with pytest.raises(SubmissionError, match=message):
-        read_result(file)
-
-
 def test_comparison_is_paired_and_says_so(make, tmp_path):
     first, second = make("one", noise_mm=2.0, name="One"), make("two", noise_mm=1.0, name="Two")
     comparison = compare(read_result(first), read_result(second))
@@ -296,17 +240,10 @@ def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
         "submission.name" in (output := capsys.readouterr().out)
         and "submission.frames_used" in output
     )
+    file.write_text(file.read_text().replace('"protocol_version": "', '"protocol_version": "9'))
+    assert "scored by protocol 9" in refusal(fpp_eval, *command)
     (folder / f"{sample}.npy").unlink()
     assert fpp_eval(*command) == 2
-
-
-def test_verify_on_other_data_and_other_protocol(make, dataset, tmp_path, capsys):
-    other_dataset = make_dataset(tmp_path / "other", size=(40, 32))
-    file = make("p", noise_mm=2.0)
-    assert fpp_eval("verify", file, tmp_path / "p", other_dataset.path) == 1
-    assert "dataset.content.test/depth" in capsys.readouterr().out
-    file.write_text(file.read_text().replace('"protocol_version": "', '"protocol_version": "9'))
-    assert "scored by protocol 9" in refusal(fpp_eval, "verify", file, tmp_path / "p", dataset.path)
 
 
 def test_schema_describes_the_file(make):

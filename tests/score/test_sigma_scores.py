@@ -7,7 +7,7 @@ from conftest import fpp_eval, printed
 from scored_dataset import change_json, make_dataset, write_description
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL
+from fpp_ml_bench.evaluation.protocol import NOMINAL
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
@@ -36,20 +36,6 @@ def test_a_calibrated_predictor_gets_its_nominal_coverage_and_a_lying_one_does_n
         < score_sigma(*gaussian()[:2], np.ones((300, 400))).scores["ause_mae_mm"]
     )
     assert honest.scores["sure_rmse_mm"] < honest.curves["rmse_mm"][0]
-
-
-def test_a_perfect_predictor_scores_0_and_knowing_its_errors_leaves_no_area():
-    target = gaussian()[1]
-    perfect = score_sigma(target, target, np.ones_like(target)).scores
-    assert {
-        perfect[key] for key in ("ause_mae_mm", "ause_rmse_mm", "sure_mae_mm", "sure_rmse_mm")
-    } == {0.0}
-    assert {perfect[f"coverage_{percent}"] for percent in COVERED} == {1.0} and perfect[
-        "unstated_share"
-    ] == 0.0
-    prediction, target, _ = gaussian()
-    knowing = score_sigma(prediction, target, np.abs(prediction - target)).scores
-    assert knowing["ause_mae_mm"] == knowing["ause_rmse_mm"] == 0.0
 
 
 def test_nothing_stated_and_no_object_have_no_score():

@@ -8,7 +8,7 @@ from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.report.terminal import result_table
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
+from fpp_ml_bench.loaders.sample import Flag, void_pixels
 
 
 def flagged(depth):
@@ -24,12 +24,6 @@ def flagged(depth):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     return make_dataset(tmp_path_factory.mktemp("data") / "tiny", flagged=flagged)
-
-
-def test_only_unlit_and_mixed_are_void():
-    flags = np.arange(16, dtype=np.uint8).reshape(4, 4)
-    assert np.array_equal(void_pixels(flags), [[(value & 3) > 0 for value in row] for row in flags])
-    assert Flag.UNLIT | Flag.MIXED == VOID
 
 
 def test_surface_that_was_not_decoded_is_void_too():

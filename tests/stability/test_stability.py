@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from conftest import fpp_bench, printed, refusal
 
 from fpp_ml_bench.baselines.stability.cases import (
     CASES,
     GROUPS,
-    Case,
     Outcome,
     Row,
     all_cases,
@@ -19,7 +19,6 @@ from fpp_ml_bench.baselines.stability.cases import (
     worst,
     write_report,
 )
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DecodeError, StabilityError
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
 
@@ -211,9 +210,9 @@ def test_every_group_has_cases_that_say_what_they_are():
 
 
 def test_the_report_says_what_failed(tmp_path):
-    rows = run_cases(
-        [*cases_of("order", "arctangent"), case(lambda: Outcome(2.0, 1.0)), failing_case()]
-    )
+    endless = Outcome(float("inf"), 1.0, note="<b>not bold</b>")
+    made_up = [case(lambda: Outcome(2.0, 1.0)), case(lambda: endless)]
+    rows = run_cases([*cases_of("order", "arctangent"), *made_up])
     data, picture = write_report(rows, tmp_path / "out")
     content = json.loads(data.read_text(encoding="utf-8"))
     assert content == json.loads(json.dumps(document(rows)))
@@ -222,20 +221,15 @@ def test_the_report_says_what_failed(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def failing_case() -> Case:
-    return case(lambda: Outcome(float("inf"), 1.0, note="<b>not bold</b>"))
-
-
 def test_the_command(tmp_path, capsys, monkeypatch):
-    assert main(["stability", "--group", "normalisation", "--json", "-"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert content["summary"]["normalisation"]["FAIL"] == 0
-    assert main(["stability", "--group", "rig", "--list"]) == 0
-    assert "rig: intrinsic matrix (30)" in capsys.readouterr().out
+    content = printed(fpp_bench, "stability", "--group", "normalisation", "--json", "-")
+    assert json.loads(content)["summary"]["normalisation"]["FAIL"] == 0
+    listed = printed(fpp_bench, "stability", "--group", "rig", "--list")
+    assert "rig: intrinsic matrix (30)" in listed
     (tmp_path / "file").write_text("x")
-    assert main(["stability", "--group", "rig", "--out", str(tmp_path / "file")]) == 2
-    assert main(["stability", "--group", "chance"]) == 2
+    for words in (["--group", "rig", "--out", tmp_path / "file"], ["--group", "chance"]):
+        assert refusal(fpp_bench, "stability", *words)
     broken = break_interval(monkeypatch)
     monkeypatch.setattr("fpp_ml_bench.cli.tradeoff.all_cases", lambda *_, **__: broken)
-    assert main(["stability", "--group", "order"]) == 1
+    assert fpp_bench("stability", "--group", "order") == 1
     assert "FAIL order: arctangent" in capsys.readouterr().out

@@ -514,7 +514,6 @@ def test_forms_cannot_be_mixed_and_links_are_refused(dataset, tmp_path):
 
 UNITS = {
     "metres as mm": ("mm", lambda d: d / 1000, {}, "looks like metres .*declare units: m"),
-    "normalised as mm": ("mm", lambda d: d / d.max(), {}, "looks like metres or normalised depth"),
     "mm as metres": ("m", lambda d: d, {}, "does not look like metres: .*declare units: mm"),
     "normalised as metres": (
         "m",
@@ -526,20 +525,7 @@ UNITS = {
         "normalised",
         lambda d: d / 1000,
         ORACLE,
-        "normalised depth: .*m or mm",
-    ),
-    "mm as normalised": ("normalised", lambda d: d, ORACLE, "does not look like normalised"),
-    "normalised, metric track": (
-        "normalised",
-        lambda d: d / 3000,
-        {},
-        "needs uses_ground_truth_range: true",
-    ),
-    "scale without PNG": (
-        "mm",
-        lambda d: d,
-        {"png_mm_per_level": 0.1},
-        "png_mm_per_level is given, but",
+        "does not look like normalised depth: .*m or mm",
     ),
     "scale in metres": ("m", lambda d: d / 1000, {"png_mm_per_level": 0.1}, "units must be mm"),
     "negative scale": (

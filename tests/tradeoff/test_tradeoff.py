@@ -9,10 +9,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import fpp_bench, printed, read_json, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from scored_dataset import make_dataset, write_predictions
+from scored_dataset import HARDWARE, make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.registry import code_in, load_from_file
@@ -29,7 +30,6 @@ from fpp_ml_bench.baselines.tradeoff.measure import (
 )
 from fpp_ml_bench.baselines.tradeoff.report import growth_table, point_table, remarks, write_report
 from fpp_ml_bench.baselines.training.weights import shipped_names
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import exclusive
@@ -70,13 +70,8 @@ class Answer(Method):
     name, title, settings = "answer", "Answer", {}
 
     def __init__(self, dataset, offset_mm=0.0, rows=0, frame=0, threads=1):
-        self.dataset, self.offset_mm, self.rows, self.frames_used, self.threads = (
-            dataset,
-            offset_mm,
-            rows,
-            (frame,),
-            threads,
-        )
+        self.dataset, self.offset_mm, self.rows = dataset, offset_mm, rows
+        self.frames_used, self.threads = (frame,), threads
 
     def predict(self, frames):
         # The dataset's frames hold one grey level each: the sample's number among those of its
@@ -124,6 +119,10 @@ def plan_of(dataset, out, *names, **changes):
     return plan
 
 
+def measured(*words, **changes):
+    return measure.tradeoff(plan_of(*words, **changes))
+
+
 def test_a_point_is_what_the_evaluator_says(small, tmp_path, answers):
     folder = write_predictions(tmp_path / "predictions", small, offset_mm=0.0)
     for sample in small.samples("test"):
@@ -133,7 +132,7 @@ def test_a_point_is_what_the_evaluator_says(small, tmp_path, answers):
         np.save(folder / f"{sample}.npy", depth)
     expected = evaluate(folder, small, target="depth_exact")
     answers.variants["good"] = [{"offset_mm": 3.0, "rows": 16}]
-    (point,) = measure.tradeoff(plan_of(small, tmp_path / "out", "good", views=2)).points
+    (point,) = measured(small, tmp_path / "out", "good", views=2).points
     assert (
         point.frames == 1
         and point.seconds > 0
@@ -165,14 +164,14 @@ def test_a_long_reason_and_a_failure_in_ones_own_file_are_reasons(
 
         monkeypatch.setattr(measure, "load_method", load_method)
         out = tmp_path / str(number)
-        measure.tradeoff(plan_of(small, out, "good"))
+        measured(small, out, "good")
         (point,) = measure.read_tradeoff(out / measure.TRADEOFF_FILE).points
         assert says in point.failed and point.seconds is None
 
 
 def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answers, monkeypatch):
     answers.variants["good"] = [{"frame": 7}]
-    run = measure.tradeoff(plan_of(small, tmp_path / "out", "good", "bad"))
+    run = measured(small, tmp_path / "out", "good", "bad")
     failed, one_size = run.points
     assert (
         "frame 7 is not stored" in failed.failed
@@ -190,13 +189,13 @@ def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answ
     )
     for wrong in (np.float32([[1]]), np.full(small.size, np.nan, np.float32)):
         monkeypatch.setattr(Answer, "predict", lambda self, frames, wrong=wrong: wrong)
-        (point,) = measure.tradeoff(plan_of(small, tmp_path / "wrong", "bad")).points
+        (point,) = measured(small, tmp_path / "wrong", "bad").points
         assert "power_drill_A0: the method gave" in point.failed and point.object_mae_mm is None
 
 
 def test_told_and_trivial_methods_are_on_no_front(small, tmp_path, answers, monkeypatch):
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", True)
-    run = measure.tradeoff(plan_of(small, tmp_path / "told", "bad"))
+    run = measured(small, tmp_path / "told", "bad")
     assert (
         run.points[0].off_front_reason
         == "given the view's object mask"
@@ -204,7 +203,7 @@ def test_told_and_trivial_methods_are_on_no_front(small, tmp_path, answers, monk
     )
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", False)
     answers.trivial = True
-    run = measure.tradeoff(plan_of(small, tmp_path / "trivial", "bad"))
+    run = measured(small, tmp_path / "trivial", "bad")
     assert run.points[0].off_front_reason == "trivial" and all(
         run.front(cost) == [] for cost in COST_KEYS
     )
@@ -218,7 +217,7 @@ def test_views_are_spread_and_differ_between_objects(small):
 
 
 def test_threads_go_to_the_methods_that_take_them(small, tmp_path, answers):
-    measure.tradeoff(plan_of(small, tmp_path / "out", "bad", threads=2))
+    measured(small, tmp_path / "out", "bad", threads=2)
     assert answers.made == [("bad", {"offset_mm": 9.0, "threads": 2})]
 
 
@@ -255,13 +254,7 @@ def tradeoff_of(dataset, points):
         target="depth_exact",
         views=["power_drill_A0"],
         settings={"package": "1", "threads": 1, "clock": "wall"},
-        hardware={
-            "cpu": "Some CPU",
-            "cores": 2,
-            "memory_gib": 8.0,
-            "gpu": None,
-            "platform": "Linux",
-        },
+        hardware=HARDWARE,
         pixels=[100, 200, 400],
         points=list(points),
     )
@@ -284,18 +277,14 @@ def test_the_front_is_what_no_point_beats(triples, cost):
         and (getattr(better, cost), better.object_mae_mm)
         != (getattr(beaten_point, cost), beaten_point.object_mae_mm)
     }
+    front = [(getattr(member, cost), member.object_mae_mm) for member in run.front(cost)]
     assert {p.key for p in run.front(cost)} == {p.key for p in points} - beaten
-
-
-def test_no_power_comes_from_one_amount_or_from_none():
-    assert (
-        power([(5, 1.0), (5, 2.0)]) is None
-        and power([]) is None
-        and power([(0, 1.0), (5, 2.0)]) is None
-    )
+    assert front == sorted(front)
 
 
 def test_a_power_is_that_of_least_squares():
+    for pairs in ([(5, 1.0), (5, 2.0)], [], [(0, 1.0), (5, 2.0)]):
+        assert power(pairs) is None
     amounts = [10, 20, 40, 80, 160]
     seconds = (
         2e-3 * np.array(amounts) ** 1.4 * np.exp(0.1 * np.random.default_rng(1).standard_normal(5))
@@ -326,12 +315,10 @@ def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path, ans
     first = measure.tradeoff(plan_of(small, tmp_path, "a", "lost"), seen.append)
     assert seen == ["a", "a offset_mm=2.0", "lost frame=7"] and len(answers.made) == 3
     assert read_tradeoff(tmp_path / TRADEOFF_FILE) == first
-    second = measure.tradeoff(plan_of(small, tmp_path, "a", "lost"))
+    second = measured(small, tmp_path, "a", "lost")
     assert len(answers.made) == 4 and answers.made[-1][0] == "lost" and second == first
     answers.variants["more"] = [{}]
-    third = measure.tradeoff(
-        plan_of(small, tmp_path, "more")
-    )  # what the folder holds of others stays
+    third = measured(small, tmp_path, "more")  # what the folder holds of others stays
     assert [p.label for p in third.points] == ["a", "a offset_mm=2.0", "lost frame=7", "more"]
 
 
@@ -344,16 +331,16 @@ def test_a_changed_file_is_measured_again(small, tmp_path, answers, monkeypatch)
     )
     for content, times in (("1", 1), ("1", 1), ("2", 2)):
         (tmp_path / "mine.py").write_text(content)
-        measure.tradeoff(plan_of(small, tmp_path / "out", "mine.py:Mine"))
+        measured(small, tmp_path / "out", "mine.py:Mine")
         assert len(answers.made) == times
 
 
 def test_runs_of_other_data_settings_or_machines_do_not_mix(small, tmp_path, answers, monkeypatch):
-    measure.tradeoff(plan_of(small, tmp_path, "bad"))
+    measured(small, tmp_path, "bad")
     with pytest.raises(SubmissionError, match=r"another settings .*give another --out"):
-        measure.tradeoff(plan_of(small, tmp_path, "bad", clock="processor"))
+        measured(small, tmp_path, "bad", clock="processor")
     with pytest.raises(SubmissionError, match="another views"):
-        measure.tradeoff(plan_of(small, tmp_path, "bad", views=2))
+        measured(small, tmp_path, "bad", views=2)
     machine = measure.describe_hardware().to_dict() | {"cpu": "Another"}
     with (
         monkeypatch.context() as patched,
@@ -362,27 +349,19 @@ def test_runs_of_other_data_settings_or_machines_do_not_mix(small, tmp_path, ans
         patched.setattr(
             measure, "describe_hardware", lambda: SimpleNamespace(to_dict=lambda: machine)
         )
-        measure.tradeoff(plan_of(small, tmp_path, "bad"))
-    other = make_dataset(
-        tmp_path / "other", scene=lambda n: (np.full((32, 40), n, np.uint8), small_depth(n))
-    )
+        measured(small, tmp_path, "bad")
+    other = make_dataset(tmp_path / "other", size=(40, 32))
     with pytest.raises(SubmissionError, match="another fingerprint"):
-        measure.tradeoff(plan_of(other, tmp_path, "bad"))
+        measured(other, tmp_path, "bad")
     with (
         exclusive(tmp_path / ".lock", tmp_path, "measuring"),
         pytest.raises(BuildError, match="another process"),
     ):
-        measure.tradeoff(plan_of(small, tmp_path, "bad"))
+        measured(small, tmp_path, "bad")
     for content in ("nonsense\n", '{"tradeoff_schema_version": "1.0.0"}'):
         (tmp_path / TRADEOFF_FILE).write_text(content)
         with pytest.raises(SubmissionError, match="into another --out"):
-            measure.tradeoff(plan_of(small, tmp_path, "bad"))
-
-
-def small_depth(number):
-    depth = np.zeros((32, 40), np.float32)
-    depth[8:24, 8:24] = 1700 + number
-    return depth
+            measured(small, tmp_path, "bad")
 
 
 def test_the_clock_is_the_wall_or_the_processor_and_long_runs_are_not_repeated(
@@ -413,7 +392,7 @@ def test_files_hold_what_was_measured(small, tmp_path):
     assert lines[4] == "| exact | time, frames, memory | 0.500 | 0.0% | 20 | 10 | 2 |"
     assert lines[5] == "| few&#124;frames | frames | 9.000 | 0.0% | 200 | 1 | 2 |"
     assert read_tradeoff(tmp_path / TRADEOFF_FILE) == run
-    broken = json.loads((tmp_path / TRADEOFF_FILE).read_text())
+    broken = read_json(tmp_path / TRADEOFF_FILE)
     broken["points"][0]["frames"] = "ten"
     (tmp_path / "broken.json").write_text(json.dumps(broken))
     with pytest.raises(SubmissionError, match=r"points\.0\.frames"):
@@ -425,28 +404,16 @@ def test_files_hold_what_was_measured(small, tmp_path):
         read_tradeoff(tmp_path / "broken.json")
 
 
-def test_the_command_measures(tiny, tmp_path, capsys, monkeypatch):
+def test_the_command_measures(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(OWN_METHOD)
-    command = [
-        "tradeoff",
-        str(tiny),
-        "--quick",
-        "--method",
-        "classical",
-        "--method",
-        "mine.py:Flat",
-    ]
-    assert main([*command, "--list"]) == 0 and not (tmp_path / "tradeoff").exists()
-    listed = capsys.readouterr().out
+    command = ["tradeoff", tiny, "--quick", "--method", "classical", "--method", "mine.py:Flat"]
+    listed = printed(fpp_bench, *command, "--list")
+    assert not (tmp_path / "tradeoff").exists()
     assert "classical steps=3 fewest\n" in listed and listed.endswith("8 points on 1 views.\n")
-    assert main(command) == 0
-    printed = capsys.readouterr().out
-    assert (
-        "Front of" in printed
-        and "How time grows" in printed
-        and "Written: tradeoff/tradeoff.png" in printed
-    )
+    said = printed(fpp_bench, *command)
+    assert "Front of" in said and "How time grows" in said
+    assert "Written: tradeoff/tradeoff.png" in said
     run = read_tradeoff(tmp_path / "tradeoff" / TRADEOFF_FILE)
     assert len(run.points) == 8 and not any(p.failed for p in run.points) and len(run.pixels) == 3
     by_label = {p.label: p for p in run.points}
@@ -474,19 +441,19 @@ def test_sizes_are_smaller_where_the_fringes_allow_it(tiny, tmp_path):
     assert [len(frames) for frames in plan.scenes[:1]] == [52]
 
 
-def test_refusals(small, tiny, tmp_path, capsys):
-    assert main(["tradeoff", str(tmp_path / "absent")]) == 2
-    assert main(["tradeoff", str(tiny), "--method", "nothing-known", "--list"]) == 2
-    assert "nothing-known" in capsys.readouterr().err
-    (tmp_path / "file").write_text("")
-    assert (
-        main(["tradeoff", str(small.path), "--out", str(tmp_path / "file"), "--method", "constant"])
-        == 2
-    )
-    assert main(["leaderboard", "--tradeoff", str(tmp_path / "file")]) == 2
-    assert "--page" in capsys.readouterr().err
-    for words in (["--threads", "0"], ["--views", "0"], ["--clock", "sun"]):
-        assert main(["tradeoff", str(tiny), *words]) == 2
+def test_refusals(small, tiny, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    for words, said in (
+        (["tradeoff", tmp_path / "absent"], "absent"),
+        (["tradeoff", tiny, "--method", "nothing-known", "--list"], "nothing-known"),
+        (["tradeoff", small.path, "--out", file, "--method", "constant"], "file"),
+        (["leaderboard", "--tradeoff", file], "--page"),
+        (["tradeoff", tiny, "--threads", "0"], "--threads"),
+        (["tradeoff", tiny, "--views", "0"], "--views"),
+        (["tradeoff", tiny, "--clock", "sun"], "--clock"),
+    ):
+        assert said in refusal(fpp_bench, *words)
 
 
 @pytest.mark.processes

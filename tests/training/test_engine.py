@@ -224,26 +224,11 @@ def test_two_processes_agree(tiny, tmp_path):
         "pairs_per_epoch: 4\nvalidation_pairs: 3\n"
     )
     code = "from accelerate.commands.launch import main; main()"
-    options = "--cpu --num_processes 2 --num_machines 1 --mixed_precision no --dynamo_backend no"
-    command = [
-        "-m",
-        "fpp_ml_bench",
-        "train",
-        tmp_path / "mine.yaml",
-        tiny,
-        "--out",
-        tmp_path / "run",
-    ]
+    options = "--cpu --num_processes 2 --num_machines 1 --mixed_precision no --dynamo_backend no "
+    options += "--main_process_port 0 -m fpp_ml_bench train"
+    files = [tmp_path / "mine.yaml", tiny, "--out", tmp_path / "run"]
     done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            code,
-            *options.split(),
-            "--main_process_port",
-            "0",
-            *map(str, command),
-        ],
+        [sys.executable, "-c", code, *options.split(), *map(str, files)],
         cwd=Path(__file__).resolve().parent.parent,
         capture_output=True,
         text=True,
