@@ -3,6 +3,8 @@ real client."""
 
 import hashlib
 import shutil
+import subprocess
+import sys
 from collections import namedtuple
 
 import numpy as np
@@ -22,6 +24,7 @@ from published_trees import (
     write_mat,
 )
 from published_trees import PUBLISHED as NAME
+from publishing import ROOT
 
 import fpp_ml_bench
 from fpp_ml_bench.errors import DatasetError
@@ -250,3 +253,15 @@ def test_opening_a_folder_that_is_not_there_says_how_to_build_it(run, name, tmp_
     (tmp_path / "sets").mkdir()
     with pytest.raises(DatasetError, match="no such folder; build one with: fpp-bench build"):
         fpp_ml_bench.load_dataset(name)
+
+
+@pytest.mark.processes
+def test_help_does_not_wait_for_the_client():
+    code = (
+        "import sys\nfrom fpp_ml_bench.cli import main\nassert main(['import', '--help']) == 0\n"
+        "print({'huggingface_hub', 'datasets'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "set()"
