@@ -9,17 +9,34 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import Sequence
+
+
+def opencv_matrix(device):
+    """Intrinsic matrix of a camera or projector, as OpenCV takes it."""
+    return np.array([[device.fx, 0, device.cx], [0, device.fy, device.cy], [0, 0, 1]])
+
+
+def rig_with(sequence, size=200, **changes):
+    """The paper's rig with another sequence, as a rig file holds it, and other ``changes``; a key
+    that is set to ``...`` is left out."""
+    pitch = {} if "steps" in sequence else {"pitch_px": ...}
+    data = {**paper_rig(size).to_dict(), **pitch, "sequence": sequence, **changes}
+    return rig_from_dict({key: value for key, value in data.items() if value is not ...})
+
+
+def projected(rig, depth_m):
+    """Projector coordinates u and v of what each camera pixel sees at ``depth_m``, (H, W) or one
+    number for all."""
+    x, y = rig.camera.rays()
+    return rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * np.expand_dims(depth_m, -1))
 
 
 def capture(rig, depth_m, noise=1.0, seed=0, albedo=0.45, ambient=4.0):
     """Frames of a surface at ``depth_m`` (H, W): pattern lookup by OpenCV, light, noise and 8
     bits."""
-    x, y = rig.camera.rays()
-    u, v = (
-        coordinates.astype(np.float32)
-        for coordinates in rig.project(np.stack([x * depth_m, y * depth_m, depth_m], axis=-1))
-    )
+    u, v = (coordinates.astype(np.float32) for coordinates in projected(rig, depth_m))
     rng = np.random.default_rng(seed)
     frames = []
     for index in range(len(rig.sequence)):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import tempfile
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -57,6 +58,12 @@ def tiny(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def copied(tiny, tmp_path):
+    """A copy of the tiny dataset, to be changed."""
+    return Path(shutil.copytree(tiny, tmp_path / "copy"))
+
+
 @pytest.fixture(scope="session")
 def opened(tiny):
     """The tiny dataset, opened for reading."""
@@ -103,17 +110,17 @@ def predictions(tmp_path, dataset):
 
 
 def fpp_bench(*words):
-    """Exit status of ``fpp-bench``."""
+    """Exit status of ``fpp-bench`` with these words; a text may hold several, or a whole line."""
     from fpp_ml_bench.cli import main
 
-    return main([str(word) for word in words])
+    return main(" ".join(map(str, words)).split())
 
 
 def fpp_eval(*words):
-    """Exit status of ``fpp-eval``."""
+    """Exit status of ``fpp-eval``, as `fpp_bench`."""
     from fpp_ml_bench.cli import main_eval
 
-    return main_eval([str(word) for word in words])
+    return main_eval(" ".join(map(str, words)).split())
 
 
 def printed(command, *words):
@@ -124,11 +131,26 @@ def printed(command, *words):
 
 
 def refusal(command, *words):
-    """What a ``command`` says that refuses its arguments."""
+    """What a ``command`` says that refuses its arguments, in words and not by a traceback."""
     with redirect_stderr(StringIO()) as err:
         assert command(*words) == 2
+    assert "Traceback" not in err.getvalue()
     return err.getvalue()
 
 
 def read_json(path):
     return json.loads(path.read_text())
+
+
+def read_image(path):
+    """Pixels of an image file as they are stored."""
+    import cv2
+
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def flip(path, share=0.5):
+    """Change a bit of a file, at this share of its length."""
+    content = bytearray(path.read_bytes())
+    content[int(len(content) * share)] ^= 0x10
+    path.write_bytes(content)

@@ -13,7 +13,6 @@ import scipy.io
 from hub_server import HubServer, Repo
 from huggingface_hub import constants
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.published.importing import import_rows, plan_import
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -139,10 +138,6 @@ def hub_of(tree, cache, monkeypatch):
 def imported(tree, out, workers=1, **settings):
     import_rows(out, plan_import(tree, **settings), workers)
     return DatasetFolder(out)
-
-
-def command(*words):
-    return main([str(word) for word in words])
 
 
 def fringe_path(root, split="test", stem="power_drill_A60", variant="raw"):

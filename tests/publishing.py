@@ -114,10 +114,11 @@ class Client:
             env=self.environment(**environment),
         )
 
-    def run(self, *calls: list[str], **environment: str | None) -> list[tuple[int, str, str]]:
-        """Exit status, standard output and standard error of each call."""
+    def run(self, *calls: str | list[str], **environment: str | None) -> list[tuple[int, str, str]]:
+        """Exit status, standard output and standard error of each call, a line or its words."""
         process = self._start(**environment) if environment else self._process
-        answers = [self._answer(process, call) for call in calls]
+        lines = [call.split() if isinstance(call, str) else call for call in calls]
+        answers = [self._answer(process, words) for words in lines]
         if environment:
             stop(process)
         return answers
@@ -131,7 +132,7 @@ class Client:
         status, out, err = json.loads(line)
         return status, out, err
 
-    def good(self, call: list[str], **environment: str | None) -> str:
+    def good(self, call: str | list[str], **environment: str | None) -> str:
         ((status, out, err),) = self.run(call, **environment)
         assert status == 0, err
         return out

@@ -30,23 +30,24 @@ def board_pose(index, points_mm):
     return turn, centre - cv2.Rodrigues(turn)[0] @ points_mm.mean(0)
 
 
-def project(points_mm, index, middle=None):
-    """Image and projector coordinates (n, 2) of points on the board of pose ``index``."""
-    turn, shift = board_pose(index, points_mm if middle is None else middle)
-    composed = cv2.composeRT(turn, shift, TURN, SHIFT_MM)
-    image = cv2.projectPoints(points_mm, turn, shift, CAMERA, CAMERA_TERMS)[0]
-    shown = cv2.projectPoints(points_mm, composed[0], composed[1], PROJECTOR, PROJECTOR_TERMS)[0]
+def project_at(points_mm, turn, shift_mm):
+    """Image and projector coordinates (n, 2) of points on a board that is turned and shifted."""
+    image = cv2.projectPoints(points_mm, turn, shift_mm, CAMERA, CAMERA_TERMS)[0]
+    composed = cv2.composeRT(turn, shift_mm, TURN, SHIFT_MM)[:2]
+    shown = cv2.projectPoints(points_mm, *composed, PROJECTOR, PROJECTOR_TERMS)[0]
     return image.reshape(-1, 2), shown.reshape(-1, 2)
 
 
+def project(points_mm, index, middle=None):
+    """The same, of points on the board of pose ``index``."""
+    return project_at(points_mm, *board_pose(index, points_mm if middle is None else middle))
+
+
 def pose(name, corners, shown, sigma_px=0.0):
-    jacobian = np.zeros((len(corners), 2, 2))
-    return Pose(
-        name,
-        CAMERA_SIZE,
-        corners,
-        ProjectorPoints(shown, np.full_like(shown, sigma_px), jacobian, {}),
+    points = ProjectorPoints(
+        shown, np.full_like(shown, sigma_px), np.zeros((len(corners), 2, 2)), {}
     )
+    return Pose(name, CAMERA_SIZE, corners, points)
 
 
 def poses(points_mm, count=6, noise_px=0.0, seed=0):

@@ -2,6 +2,7 @@
 photographed."""
 
 import pytest
+from captures import rig_with
 
 from fpp_ml_bench.calibration.projector_points import fit_response
 from fpp_ml_bench.loaders.captures.decoding import board_poses
@@ -9,23 +10,19 @@ from fpp_ml_bench.loaders.render.boards.captures import photograph_board
 from fpp_ml_bench.loaders.render.boards.poses import board_poses as poses_of
 from fpp_ml_bench.loaders.render.boards.poses import fitting_board
 from fpp_ml_bench.loaders.render.light import named_light
-from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 pytestmark = pytest.mark.long
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.6])
 def test_gamma_is_that_of_the_light(tmp_path, gamma):
-    data = paper_rig(480).to_dict()
-    del data["pitch_px"]
+    wave = {"scheme": "phase-shift", "steps": [4, 8]}
     codes = {
-        "vertical": {"scheme": "phase-shift", "pitches_px": [24, 912], "steps": [4, 8]},
-        "horizontal": {"scheme": "phase-shift", "pitches_px": [24, 1140], "steps": [4, 8]},
+        "order": ["vertical", "horizontal", "white"],
+        "vertical": {**wave, "pitches_px": [24, 912]},
+        "horizontal": {**wave, "pitches_px": [24, 1140]},
     }
-    rig = rig_from_dict(
-        {**data, "sequence": {"order": ["vertical", "horizontal", "white"], **codes}}
-    )
+    rig = rig_with(codes, 480)
     board = fitting_board(rig)
     light = named_light("paper").changed("projector", response=gamma)
     photograph_board(tmp_path / "boards", rig, board, poses_of(rig, board, 3), light)

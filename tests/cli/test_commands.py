@@ -2,20 +2,21 @@
 
 import json
 import shlex
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from shutil import rmtree
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
-from conftest import TINY_SIZE
+from conftest import TINY_SIZE, fpp_bench, printed, refusal
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.cli import BENCH, COMMANDS, EVAL, Program, main
+from fpp_ml_bench.cli import BENCH, COMMANDS, EVAL, Program
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -24,7 +25,7 @@ from fpp_ml_bench.optics.rig_file import save_rig
 from fpp_ml_bench.optics.sequence import Sequence
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAVY = (
+HEAVY = {
     "numpy",
     "torch",
     "datasets",
@@ -36,15 +37,7 @@ HEAVY = (
     "pydantic",
     "yaml",
     "trimesh",
-)
-
-
-def call(*arguments, command=main):
-    """Exit status of a command run in this process; unexpected errors are raised."""
-    try:
-        return command([str(a) for a in arguments])
-    except SystemExit as stop:
-        return 0 if stop.code is None else stop.code
+}
 
 
 # ---- help
@@ -82,9 +75,8 @@ def helps():
 @pytest.mark.parametrize("name", [*AT_ONCE, *COMMANDS])
 def test_help_answers_without_importing_anything_heavy(helps, name):
     status, text, imported = helps[name]
-    assert status == 0 and not set(imported) & (
-        set(HEAVY) if name in AT_ONCE else {"torch", "datasets"}
-    )
+    heavy = HEAVY if name in AT_ONCE else {"torch", "datasets"}
+    assert status == 0 and heavy.isdisjoint(imported)
     assert "usage:" in text and "examples:" in text
     if name not in AT_ONCE:
         assert f"usage: fpp-bench {name}" in text
@@ -101,11 +93,9 @@ def test_help_of_the_program_imports_no_command(helps):
     assert imported <= {"cli", "cli.options", "errors", "files", "machine", "options"}
 
 
-def test_version_and_no_arguments(capsys):
-    assert call("--version") == 0
-    assert capsys.readouterr().out.startswith("fpp-ml-bench ")
-    assert call() == 2
-    assert "usage: fpp-bench" in capsys.readouterr().err
+def test_version_and_no_arguments():
+    assert printed(fpp_bench, "--version").startswith("fpp-ml-bench ")
+    assert "usage: fpp-bench" in refusal(fpp_bench)
 
 
 def test_every_command_of_the_tables_is_grouped_and_says_what_it_does():
@@ -153,60 +143,53 @@ def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("line", "message"),
     [
-        (["bild"], "did you mean 'build'"),
-        (["--bogus"], "unknown option '--bogus'"),
-        (["build", "--out", "OUT", "--size", "0"], "1 to 8192"),
-        (["build", "--out", "OUT", "--size", "120"], "pitch of at least"),
-        (["build", "--out", "OUT", "--preset", "huge"], "--preset"),
-        (["build", "--out", "OUT", "--config", "some"], "--config some: there are single_shot"),
-        (["build", "--out", "OUT", "--objects", "mugg"], "did you mean 'mug'"),
-        (["build", "--out", "OUT", "--objects", ","], "name at least one"),
-        (["build", "--out", "OUT", "--seed", "-1"], "seed -1"),
-        (["build", "--out", "OUT", "--workers", "0"], "--workers 0"),
-        (["build", "--out", "OUT", "--noise-sigma", "nan"], "--noise-sigma nan: expected 0 to 50"),
-        (["build", "--out", "OUT", "--pitch", "nan"], "pitch"),
-        (["build", "--out", "OUT", "--rig", "none.yaml"], "none.yaml"),
-        (["build", "--out", "OUT", "--mesh", "none.stl"], "none.stl"),
-        (["build", "--out", "FILE", "--objects", "mug"], "is a file"),
-        (["info"], "DATASET"),
-        (["info", "OUT"], "no such folder"),
-        (["verify", "FILE"], "no such folder"),
-        (["show", "TINY"], "expected either a SAMPLE or --sheet"),
-        (["show", "TINY", "mug_A1", "--out", "x.png"], "did you mean 'mug_A"),
-        (["show", "TINY", "mug_A0", "--out", "x.jpg"], "ending in .png"),
-        (["show", "TINY", "mug_A0", "--out", "FILE/x.png"], "can't be written"),
-        (["show", "TINY", "--sheet", "--split", "val", "--out", "x.png"], "no split 'val'"),
+        ("bild", "did you mean 'build'"),
+        ("--bogus", "unknown option '--bogus'"),
+        ("build --out OUT --size 0", "1 to 8192"),
+        ("build --out OUT --size 120", "pitch of at least"),
+        ("build --out OUT --preset huge", "--preset"),
+        ("build --out OUT --config some", "--config some: there are single_shot"),
+        ("build --out OUT --objects mugg", "did you mean 'mug'"),
+        ("build --out OUT --objects ,", "name at least one"),
+        ("build --out OUT --seed -1", "seed -1"),
+        ("build --out OUT --workers 0", "--workers 0"),
+        ("build --out OUT --noise-sigma nan", "--noise-sigma nan: expected 0 to 50"),
+        ("build --out OUT --pitch nan", "pitch"),
+        ("build --out OUT --rig none.yaml", "none.yaml"),
+        ("build --out OUT --mesh none.stl", "none.stl"),
+        ("build --out FILE --objects mug", "is a file"),
+        ("info", "DATASET"),
+        ("info OUT", "no such folder"),
+        ("verify FILE", "no such folder"),
+        ("show TINY", "expected either a SAMPLE or --sheet"),
+        ("show TINY mug_A1 --out x.png", "did you mean 'mug_A"),
+        ("show TINY mug_A0 --out x.jpg", "ending in .png"),
+        ("show TINY mug_A0 --out FILE/x.png", "can't be written"),
+        ("show TINY --sheet --split val --out x.png", "no split 'val'"),
+        ("show TINY --sheet --views 0 --out x.png", "--views 0: expected 1 or more"),
+        ("show TINY --sheet --cloud --out x.png", "--cloud: expected a SAMPLE"),
+        ("predict magic TINY --out OUT", "there are classical"),
+        ("predict classical TINY --out OUT --steps 2", "3 to the 18"),
+        ("predict classical TINY --out OUT --threads 0", "--threads 0"),
+        ("predict classical TINY --out TINY", "already holds"),
+        ("train fringe-net --out OUT --unions -1", "unions -1"),
+        ("train fringe-net --out OUT --rate nan", "rate above 0"),
+        ("train fringe-net TINY --out OUT", "renders what it learns from"),
         (
-            ["show", "TINY", "--sheet", "--views", "0", "--out", "x.png"],
-            "--views 0: expected 1 or more",
-        ),
-        (["show", "TINY", "--sheet", "--cloud", "--out", "x.png"], "--cloud: expected a SAMPLE"),
-        (["predict", "magic", "TINY", "--out", "OUT"], "there are classical"),
-        (["predict", "classical", "TINY", "--out", "OUT", "--steps", "2"], "3 to the 18"),
-        (["predict", "classical", "TINY", "--out", "OUT", "--threads", "0"], "--threads 0"),
-        (["predict", "classical", "TINY", "--out", "TINY"], "already holds"),
-        (["train", "fringe-net", "--out", "OUT", "--unions", "-1"], "unions -1"),
-        (["train", "fringe-net", "--out", "OUT", "--rate", "nan"], "rate above 0"),
-        (["train", "fringe-net", "TINY", "--out", "OUT"], "renders what it learns from"),
-        (
-            ["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"],
+            "train loss/l1 TINY --out OUT --rate 0.1",
             "--rate is an option of fringe-net, not of loss/l1",
         ),
     ],
 )
 def test_bad_input_exits_2_with_a_message_and_makes_nothing(
-    tiny, tmp_path, monkeypatch, capsys, arguments, message
+    tiny, tmp_path, monkeypatch, line, message
 ):
     monkeypatch.chdir(tmp_path)
-    for name in ("FILE", "FILE.txt"):
-        Path(name).write_text("x")
-    before = sorted(tmp_path.iterdir())
-    assert call(*[str(tiny) if a == "TINY" else a for a in arguments]) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err and "Traceback" not in captured.err
-    assert sorted(tmp_path.iterdir()) == before
+    Path("FILE").write_text("x")
+    assert message in refusal(fpp_bench, line.replace("TINY", str(tiny)))
+    assert [path.name for path in tmp_path.iterdir()] == ["FILE"]
 
 
 @pytest.mark.parametrize(
@@ -220,37 +203,27 @@ def test_bad_input_exits_2_with_a_message_and_makes_nothing(
         (OSError("the stream ended"), "the stream ended"),
     ],
 )
-def test_unexpected_system_errors_are_messages(tiny, monkeypatch, capsys, error, message):
-    def fail(manifest):
-        raise error
-
-    monkeypatch.setattr("fpp_ml_bench.cli.dataset.split_statistics", fail)
-    assert call("info", tiny) == 2
-    assert capsys.readouterr().err == f"fpp-bench info: error: {message}\n"
+def test_unexpected_system_errors_are_messages(tiny, monkeypatch, error, message):
+    monkeypatch.setattr("fpp_ml_bench.cli.dataset.split_statistics", Mock(side_effect=error))
+    assert refusal(fpp_bench, "info", tiny) == f"fpp-bench info: error: {message}\n"
 
 
 def test_ctrl_c_is_130(tiny, monkeypatch, capsys):
-    def stop(manifest):
-        raise KeyboardInterrupt
-
+    stop = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr("fpp_ml_bench.cli.dataset.split_statistics", stop)
-    assert call("info", tiny) == 130
+    assert fpp_bench("info", tiny) == 130
     assert capsys.readouterr().err == "fpp-bench info: stopped\n"
     monkeypatch.setattr("fpp_ml_bench.cli.predict.DatasetFolder", stop)
-    assert call("predict", "phase", tiny, "--out", "out") == 130
+    assert fpp_bench("predict phase", tiny, "--out out") == 130
     assert "fpp-bench predict: stopped; the same command continues\n" in capsys.readouterr().err
 
 
 # ---- info
 
 
-def test_info_json_says_what_is_there(tiny, opened, capsys):
-    assert call("info", tiny, "--json", "-") == 0
-    content = json.loads(capsys.readouterr().out)
-    assert content["fingerprint"] == opened.fingerprint and content["size"] == [
-        TINY_SIZE,
-        TINY_SIZE,
-    ]
+def test_info_json_says_what_is_there(tiny, opened):
+    content = json.loads(printed(fpp_bench, "info", tiny, "--json -"))
+    assert content["fingerprint"] == opened.fingerprint and content["size"] == [TINY_SIZE] * 2
     assert content["samples"] == opened.splits
     on_disk = sum(
         p.stat().st_size for p in tiny.rglob("*") if p.is_file() and p.name != "manifest.json"
@@ -276,9 +249,8 @@ def test_info_json_says_what_is_there(tiny, opened, capsys):
         assert 0 < split["gt_interior_mae_mm"] < 0.6
 
 
-def test_info_for_people(tiny, opened, capsys):
-    assert call("info", tiny) == 0
-    out = capsys.readouterr().out
+def test_info_for_people(tiny, opened):
+    out = printed(fpp_bench, "info", tiny)
     for text in (
         opened.fingerprint,
         "baseline 160.1 mm",
@@ -294,7 +266,7 @@ def test_info_for_people(tiny, opened, capsys):
 
 def test_show_writes_a_picture_of_the_sample(tiny, tmp_path):
     out = tmp_path / "new" / "bowl.png"
-    assert call("show", tiny, "bowl_A0", "--out", out) == 0
+    assert fpp_bench(f"show {tiny} bowl_A0 --out {out}") == 0
     picture = cv2.imread(str(out))
     height, width = picture.shape[:2]
     assert width > 1000 and height > 500
@@ -312,21 +284,18 @@ def test_show_draws_fewer_views_larger_or_more_objects_in_a_line(tiny, tmp_path)
         (2, (138, 4 * 248 - 8)),
         (99, (2 * 138, 2 * 728 - 8)),
     ):
-        assert call("show", tiny, "--sheet", "--views", views, "--out", tmp_path / "x.png") == 0
+        assert fpp_bench(f"show {tiny} --sheet --views {views} --out {tmp_path}/x.png") == 0
         assert cv2.imread(str(tmp_path / "x.png"), cv2.IMREAD_GRAYSCALE).shape == size
 
 
-def test_show_with_a_damaged_mesh_names_it(tiny, tmp_path, capsys):
-    folder = tmp_path / "copy"
-    shutil.copytree(tiny, folder)
-    (folder / "meshes" / "cork.ply").write_bytes(b"ply\nhalf")
-    assert call("show", folder, "cork_A0", "--out", tmp_path / "x.png") == 2
-    assert "cork.ply" in capsys.readouterr().err
+def test_show_with_a_damaged_mesh_names_it(copied, tmp_path):
+    (copied / "meshes" / "cork.ply").write_bytes(b"ply\nhalf")
+    assert "cork.ply" in refusal(fpp_bench, f"show {copied} cork_A0 --out {tmp_path}/x.png")
 
 
 def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert call("show", tiny, "cork_A0") == 0
+    assert fpp_bench("show", tiny, "cork_A0") == 0
     assert [p.name for p in tmp_path.iterdir()] == ["cork_A0.png"]
 
 
@@ -334,61 +303,55 @@ def test_show_reads_predictions_in_the_units_that_they_declare_and_below_0_there
     tiny, tmp_path
 ):
     dataset, clouds = DatasetFolder(tiny), []
-    for units, per_mm in (("mm", 1), ("m", 0.001)):
+    for units, per_mm in (("mm", np.float32(1)), ("m", np.float32(0.001))):
         folder = write_predictions(tmp_path / units, dataset, units=units)
         for path in folder.glob("*.npy"):
-            depth = np.load(path)
-            np.save(
-                path, np.where(depth > 0, depth * np.float32(per_mm), np.float32(-0.01))
-            )  # as networks put out
-        words = "show", tiny, "power_drill_A60", "--predictions", folder, "--cloud"
-        assert call(*words, "--out", tmp_path / f"{units}.png") == 0
+            depth = np.load(path)  # below 0 as networks put out
+            np.save(path, np.where(depth > 0, depth * per_mm, np.float32(-0.01)))
+        words = f"--predictions {folder} --cloud --out {tmp_path / units}.png"
+        assert fpp_bench("show", tiny, "power_drill_A60", words) == 0
         clouds.append(trimesh.load(tmp_path / f"{units}.ply").vertices)
     assert len(clouds[0]) == np.count_nonzero(dataset.depth_mm("power_drill_A60")) > 100
     np.testing.assert_allclose(clouds[1], clouds[0], rtol=1e-6, atol=1e-9)
 
 
-def test_show_refuses_predictions_that_could_not_be_scored(tiny, tmp_path, capsys):
+def test_show_refuses_predictions_that_could_not_be_scored(tiny, tmp_path):
     folder = write_predictions(tmp_path / "predictions", DatasetFolder(tiny))
     (folder / "power_drill_A60.npy").unlink()
-    picture = tmp_path / "x.png"
-    assert call("show", tiny, "power_drill_A60", "--predictions", folder, "--out", picture) == 2
-    assert "power_drill_A60.npy: is missing" in capsys.readouterr().err and not picture.exists()
+    words = f"show {tiny} power_drill_A60 --predictions {folder} --out {tmp_path}/x.png"
+    assert "power_drill_A60.npy: is missing" in refusal(fpp_bench, words)
+    assert not (tmp_path / "x.png").exists()
 
 
-def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_path):
+@pytest.mark.parametrize("words", [f"--size {TINY_SIZE} --config single_shot", "--rig rig.yaml"])
+def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(
+    tmp_path, monkeypatch, words
+):
+    monkeypatch.chdir(tmp_path)
     coarse = replace(
         paper_rig(TINY_SIZE),
         pitch_horizontal_px=1140,
         pitch_vertical_px=912,
         sequence=Sequence(3, 1, 1),
     )
-    save_rig(coarse, tmp_path / "rig.yaml")
-    for name, options in (
-        ("one", ("--size", TINY_SIZE, "--config", "single_shot")),
-        ("few", ("--rig", tmp_path / "rig.yaml")),
-    ):
-        folder = tmp_path / name
-        assert call("build", "--out", folder, "--objects", "cork", "--workers", 1, *options) == 0
-        shutil.rmtree(folder / "meshes")
-        assert call("show", folder, "cork_A0", "--out", tmp_path / f"{name}.png") == 0
-        assert cv2.imread(str(tmp_path / f"{name}.png")) is not None
+    save_rig(coarse, Path("rig.yaml"))
+    assert fpp_bench("build --out data --objects cork --workers 1", words) == 0
+    rmtree("data/meshes")
+    assert fpp_bench("show data cork_A0 --out picture.png") == 0
+    assert cv2.imread("picture.png") is not None
 
 
 def test_contact_sheet_shows_every_object_and_view(tiny, opened, tmp_path):
     out = tmp_path / "sheet.png"
-    assert call("show", tiny, "--sheet", "--out", out) == 0
+    assert fpp_bench(f"show {tiny} --sheet --out {out}") == 0
     sheet = cv2.imread(str(out), cv2.IMREAD_GRAYSCALE)
     tile, label = 120, 18
     assert sheet.shape == (2 * (tile + label), 2 * 6 * tile + 8)
     for number, name in enumerate(("bowl", "cork", "mug", "power_drill")):
         for view_number, view in enumerate(VIEWS):
-            y, x = (
-                (number // 2) * (tile + label) + label,
-                (number % 2) * (6 * tile + 8) + view_number * tile,
-            )
-            shown = sheet[y : y + tile, x : x + tile].astype(float)
-            frame = cv2.resize(
-                opened.frame(f"{name}_{view}", 51), (tile, tile), interpolation=cv2.INTER_AREA
-            )
-            assert np.corrcoef(shown.ravel(), frame.astype(float).ravel())[0, 1] > 0.99
+            y = (number // 2) * (tile + label) + label
+            x = (number % 2) * (6 * tile + 8) + view_number * tile
+            shown = sheet[y : y + tile, x : x + tile].ravel()
+            frame = opened.frame(f"{name}_{view}", 51)
+            expected = cv2.resize(frame, (tile, tile), interpolation=cv2.INTER_AREA).ravel()
+            assert np.corrcoef(shown, expected)[0, 1] > 0.99

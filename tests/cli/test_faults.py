@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 import xxhash
-from conftest import TINY_SIZE, tiny_settings
+from conftest import TINY_SIZE, fpp_bench, fpp_eval, refusal, tiny_settings
 from disks import small_disk
 from scored_dataset import make_dataset
 
@@ -25,7 +25,7 @@ from fpp_ml_bench import files, pool
 from fpp_ml_bench.baselines.learned.recipe import FringeRecipe
 from fpp_ml_bench.baselines.learned.training import train_net
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in, save_checkpoint
-from fpp_ml_bench.cli import main, main_eval, run_command
+from fpp_ml_bench.cli import run_command
 from fpp_ml_bench.cli.console import progress_bar
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import BuildError, DatasetError, PoolError, RemoteError, TrainingError
@@ -49,22 +49,19 @@ FREE_SPACE = "free some space or choose another disk"
 
 
 def predict(dataset, out):
-    return main(["predict", "constant", str(dataset), "--out", str(out)])
+    return fpp_bench("predict constant", dataset, "--out", out)
 
 
 # ---- two at once
 
 
-def test_of_two_that_predict_into_a_folder_one_is_told(tiny, tmp_path, capsys):
+def test_of_two_that_predict_into_a_folder_one_is_told(tiny, tmp_path):
     out = tmp_path / "out"
     with exclusive(out / LOCK_FILE, out, "here"):
-        assert predict(tiny, out) == 2
-    assert (
-        f"{out}: another process is predicting into this folder; wait for it or"
-        in capsys.readouterr().err
-    )
+        said = refusal(predict, tiny, out)
+    assert f"{out}: another process is predicting into this folder; wait for it or" in said
     assert predict(tiny, out) == 0
-    assert not (out / LOCK_FILE).exists() and main_eval(["check", str(out)]) == 0
+    assert not (out / LOCK_FILE).exists() and fpp_eval("check", out) == 0
 
 
 def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
@@ -74,7 +71,7 @@ def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
     out.mkdir()
     for name in (LOCK_FILE, ".power_drill_A0.npy.123.tmp", "unfinished.jsonl"):
         (out / name).write_text("")
-    main_eval([str(out), str(tiny)])
+    fpp_eval(out, tiny)
     problems = capsys.readouterr().err
     assert (
         "unfinished.jsonl: is extra (a stopped fpp-bench predict left it: run the same command "
@@ -82,7 +79,7 @@ def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
     )
     assert LOCK_FILE not in problems
     assert predict(tiny, out) == 0
-    assert main_eval([str(out), str(tiny)]) == 0
+    assert fpp_eval(out, tiny) == 0
 
 
 def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
@@ -199,44 +196,31 @@ def files_of_at_most(count):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def test_full_disks_are_answered_with_file_and_cure(tiny, tmp_path, capsys):
-    predictions, again, rig = tmp_path / "predictions", tmp_path / "again", tmp_path / "rig.yaml"
+def test_full_disks_are_answered_with_file_and_cure(tiny, tmp_path):
+    predictions, again = tmp_path / "predictions", tmp_path / "again"
     assert predict(tiny, predictions) == 0
-    score = [str(predictions), str(tiny), "--json", str(tmp_path / "result.json")]
-    board = [
-        "calibrate",
-        "--virtual",
-        str(tmp_path / "v"),
-        "--size",
-        "256",
-        "--poses",
-        "4",
-        "--out",
-        str(rig),
-    ]
-    words = ["predict", "constant", str(tiny), "--out", str(again)]
-    for run, arguments, count, name in (
-        (main, words, 100, "again/unfinished.jsonl"),
-        (main_eval, score, 100, "result.json"),
-        (main, board, 100, "/v: "),
+    score = f"{predictions} {tiny} --json {tmp_path}/result.json"
+    board = f"calibrate --virtual {tmp_path}/v --size 256 --poses 4 --out {tmp_path}/rig.yaml"
+    for run, line, name in (
+        (fpp_bench, f"predict constant {tiny} --out {again}", "again/unfinished.jsonl"),
+        (fpp_eval, score, "result.json"),
+        (fpp_bench, board, "/v: "),
     ):
-        with files_of_at_most(count):
-            assert run(arguments) == 2
-        message = capsys.readouterr().err.splitlines()[-1]
+        with files_of_at_most(100):
+            message = refusal(run, line).splitlines()[-1]
         assert name in message and FREE_SPACE in message and "Errno" not in message, message
-    assert main_eval(score) == 0 and predict(tiny, again) == 0  # nothing is in the way
+    assert fpp_eval(score) == 0 and predict(tiny, again) == 0  # nothing is in the way
 
 
 @pytest.mark.processes
-def test_a_prediction_goes_on_after_a_really_full_disk(tiny, tmp_path, capsys):
+def test_a_prediction_goes_on_after_a_really_full_disk(tiny, tmp_path):
     with small_disk(tmp_path / "disk", "300k") as disk:
-        assert predict(tiny, disk / "out") == 2
-        message = capsys.readouterr().err
+        message = refusal(predict, tiny, disk / "out")
         assert f"{disk / 'out'}/" in message and f"No space left on device; {FREE_SPACE}" in message
         assert (disk / "out" / "unfinished.jsonl").exists()
         subprocess.run(["mount", "-o", "remount,size=2m", str(disk)], check=True)
         assert predict(tiny, disk / "out") == 0
-        assert main_eval(["check", str(disk / "out")]) == 0
+        assert fpp_eval("check", disk / "out") == 0
 
 
 def test_a_training_names_the_file_that_does_not_fit(tmp_path):
@@ -355,9 +339,8 @@ def test_too_little_memory_is_a_message(capsys):
     )
 
 
-def test_what_would_steer_the_terminal_is_escaped_in_an_error(capsys, tmp_path):
-    assert main(["info", str(tmp_path / "a\x1b[31m\x07b")]) == 2
-    said = capsys.readouterr().err
+def test_what_would_steer_the_terminal_is_escaped_in_an_error(tmp_path):
+    said = refusal(fpp_bench, f"info {tmp_path}/a\x1b[31m\x07b")
     assert "\x1b" not in said and "a\\x1b[31m\\x07b" in said
 
 
@@ -417,14 +400,9 @@ def test_an_output_that_can_not_be_written(tiny):
 
 
 def test_everything_is_written_before_a_table_that_nobody_reads(tiny, tmp_path, monkeypatch):
-    def closed(*arguments):
-        raise BrokenPipeError
-
-    monkeypatch.setattr("fpp_ml_bench.cli.console.show", closed)
-    predictions = tmp_path / "predictions"
-    assert predict(tiny, predictions) == 0
-    words = [str(predictions), str(tiny), "--report", str(tmp_path / "report")]
-    assert main_eval(words) == 141
+    monkeypatch.setattr("fpp_ml_bench.cli.console.show", Mock(side_effect=BrokenPipeError))
+    assert predict(tiny, tmp_path / "predictions") == 0
+    assert fpp_eval(f"{tmp_path}/predictions {tiny} --report {tmp_path}/report") == 141
     assert (tmp_path / "report" / "index.html").exists()
 
 
@@ -468,24 +446,19 @@ def test_sigterm_during_an_import_is_not_swallowed(tmp_path):
 @pytest.mark.processes
 def test_a_prediction_that_is_terminated_resumes(tiny, tmp_path):
     out = tmp_path / "out"
-    words = ["predict", "classical", str(tiny), "--split", "all", "--out", str(out)]
+    line = f"predict classical {tiny} --split all --out {out}"
+    words = [*COMMAND, *line.split()]
     process = subprocess.Popen(
-        [*COMMAND, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
     while not list(out.glob("*.npy")):
         assert process.poll() is None, process.communicate()
         time.sleep(0.001)
     process.terminate()
     errors = process.communicate(timeout=60)[1]
-    assert (
-        process.returncode == 143
-        and errors.endswith("fpp-bench predict: stopped; the same command continues\n")
-        and "Traceback" not in errors
-    )
-    assert (
-        (out / "unfinished.jsonl").exists()
-        and not (out / LOCK_FILE).exists()
-        and not list(out.glob(".*.tmp"))
-    )
-    assert main(words) == 0
+    assert process.returncode == 143 and "Traceback" not in errors
+    assert errors.endswith("fpp-bench predict: stopped; the same command continues\n")
+    assert (out / "unfinished.jsonl").exists() and not (out / LOCK_FILE).exists()
+    assert not list(out.glob(".*.tmp"))
+    assert fpp_bench(line) == 0
     assert np.load(next(out.glob("*.npy"))).shape == (TINY_SIZE, TINY_SIZE)

@@ -10,11 +10,11 @@ import click
 import numpy as np
 import pytest
 import yaml
+from conftest import fpp_bench, fpp_eval, printed, read_json, refusal
 from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.baselines import registry
-from fpp_ml_bench.cli import main, run_command
-from fpp_ml_bench.cli import main_eval as fpp_eval
+from fpp_ml_bench.cli import run_command
 from fpp_ml_bench.cli.options import WORKING_RANGE, command, command_line, given, names, value
 from fpp_ml_bench.options import (
     REQUIRED,
@@ -141,9 +141,9 @@ def test_fields_describe_themselves():
     assert did_you_mean("x", [f"name {number}" for number in range(200)]).endswith("name 79, ...")
 
 
-def test_almost_right_names_of_options_are_named(capsys):
-    assert main(["build", "--halp"]) == 2
-    assert "unknown option '--halp'; did you mean '--help'?" in capsys.readouterr().err
+def test_almost_right_names_of_options_are_named():
+    said = refusal(fpp_bench, "build --halp")
+    assert "unknown option '--halp'; did you mean '--help'?" in said
 
 
 # ---- methods of a user
@@ -181,180 +181,140 @@ def mine(tmp_path, monkeypatch):
     Path("mine.py").write_text(MINE)
 
 
-def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny, capsys):
-    assert main(["predict", "mine.py:Mine", str(tiny), "--out", "bright", "--lit", "200"]) == 0
+def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny):
+    assert fpp_bench("predict mine.py:Mine", tiny, "--out bright --lit 200") == 0
     settings = yaml.safe_load(Path("bright/submission.yaml").read_text())["settings"]
     assert settings == {"lit": 200, "steps": False, "source_sha256": settings["source_sha256"]}
-    assert main(["predict", "mine.py:Mine", "--help"]) == 0
-    out = capsys.readouterr().out
+    out = printed(fpp_bench, "predict mine.py:Mine --help")
     assert "mine (everything lit):\n  --lit GREY  grey level above which a pixel is lit" in out
     assert "--depth-noise" not in out  # of another method
-    assert main(["predict", "--help"]) == 0
-    out = capsys.readouterr().out
+    out = printed(fpp_bench, "predict --help")
     assert "predict METHOD --help shows the options of one" in out and "--depth-noise" not in out
     assert all(f"\n  {name} " in out for name in registry.methods())
-    assert main(["predict", "classical", "--help"]) == 0
-    assert "--depth-noise MM" in capsys.readouterr().out
+    assert "--depth-noise MM" in printed(fpp_bench, "predict classical --help")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["mine.py:Mine", "--steps"], "a method of yours failed"),
+        ("mine.py:Mine DATA --steps", "a method of yours failed"),
         (
-            ["mine.py:Mine", "--frames", "3"],
+            "mine.py:Mine DATA --frames 3",
             "--frames is an option of phase, crossed, not of mine.py:Mine; leave it out",
         ),
         (
-            ["mine.py:Clashing"],
+            "mine.py:Clashing DATA",
             "its option --split is one of fpp-bench predict; give it another flag",
         ),
-        (["mine.py:Min"], "did you mean 'Mine'"),
-        (
-            ["phase", "--frames", "3", "--error-mm", "1"],
-            "--frames and --error-mm: give one of them",
-        ),
-        (["phas"], "unknown method 'phas'; did you mean 'phase'"),
+        ("mine.py:Min DATA", "did you mean 'Mine'"),
+        ("phase DATA --frames 3 --error-mm 1", "--frames and --error-mm: give one of them"),
+        ("phas DATA", "unknown method 'phas'; did you mean 'phase'"),
+        ("DATA phase", "expected the method first, then the dataset: fpp-bench predict phase DATA"),
+        ("DATA mine.py:Mine", "then the dataset: fpp-bench predict mine.py:Mine DATA"),
     ],
 )
-def test_options_of_another_method_are_refused(mine, tiny, capsys, words, message):
-    assert main(["predict", words[0], str(tiny), "--out", "out", *words[1:]]) == 2
-    error = capsys.readouterr().err
-    assert message in error and "Traceback" not in error
+def test_options_of_another_method_are_refused(mine, tiny, words, message):
+    said = refusal(fpp_bench, "predict", words.replace("DATA", str(tiny)), "--out out")
+    assert message.replace("DATA", str(tiny)) in said
 
 
-@pytest.mark.parametrize("name", ["phase", "mine.py:Mine"])
-def test_the_method_comes_first(mine, tiny, capsys, name):
-    assert main(["predict", str(tiny), name, "--out", "out"]) == 2
-    said = f"expected the method first, then the dataset: fpp-bench predict {name} {tiny}"
-    assert said in capsys.readouterr().err
-
-
-def test_a_folder_called_as_a_method_is_a_dataset(mine, tiny, capsys):
+def test_a_folder_called_as_a_method_is_a_dataset(mine, tiny):
     Path("phase").symlink_to(tiny)
-    assert main(["predict", "constant", "phase", "--out", "out"]) == 0
-    assert "1 frame and" in capsys.readouterr().out
+    assert "1 frame and" in printed(fpp_bench, "predict constant phase --out out")
 
 
-def test_a_used_folder_is_refused_before_the_bar(mine, tiny, capsys):
+def test_a_used_folder_is_refused_before_the_bar(mine, tiny):
     Path("used").mkdir()
     Path("used/notes.txt").write_text("mine")
-    assert main(["predict", "constant", str(tiny), "--out", "used"]) == 2
-    error = capsys.readouterr().err
-    assert (
-        "already holds notes.txt; give a new or empty folder, or remove this one" in error
-        and "0%" not in error
-    )
+    error = refusal(fpp_bench, "predict constant", tiny, "--out used")
+    assert "already holds notes.txt; give a new or empty folder, or remove this one" in error
+    assert "0%" not in error
 
 
-def test_a_word_that_no_argument_takes_may_be_the_missing_option(mine, capsys):
-    assert main(["build", "data/mini"]) == 2
-    assert "did you mean --out data/mini?" in capsys.readouterr().err
+def test_a_word_that_no_argument_takes_may_be_the_missing_option():
+    assert "did you mean --out data/mini?" in refusal(fpp_bench, "build data/mini")
 
 
-def test_help_of_a_command_by_a_word(mine, capsys):
-    assert main(["help", "predict"]) == 0 and "usage: fpp-bench predict" in capsys.readouterr().out
-    assert main(["help"]) == 0 and "COMMAND ..." in capsys.readouterr().out
+def test_help_of_a_command_by_a_word():
+    assert "usage: fpp-bench predict" in printed(fpp_bench, "help predict")
+    assert "COMMAND ..." in printed(fpp_bench, "help")
 
 
-def test_measurements_go_only_to_the_code_that_was_scored(mine, tiny, capsys):
+def test_measurements_go_only_to_the_code_that_was_scored(mine, tiny):
     Path("other.py").write_text(MINE.replace("1500", "1501"))
-    assert main(["predict", "mine.py:Mine", str(tiny), "--out", "out"]) == 0
-    assert fpp_eval(["out", "--json", "result.json"]) == 0
+    assert fpp_bench("predict mine.py:Mine", tiny, "--out out") == 0
+    assert fpp_eval("out --json result.json") == 0
     for name in ("time", "reliance"):
-        assert main([name, "other.py:Mine", str(tiny), "--into", "result.json"]) == 2
-        error = capsys.readouterr().err
+        error = refusal(fpp_bench, name, "other.py:Mine", tiny, "--into result.json")
         assert "settings.source_sha256 is" in error and "give the same options and code" in error
-    assert main(["time", "mine.py:Mine", str(tiny), "--repeats", "1", "--into", "result.json"]) == 0
+    assert fpp_bench("time mine.py:Mine", tiny, "--repeats 1 --into result.json") == 0
 
 
 # ---- scoring without naming the dataset
 
 
 @pytest.fixture
-def predicted(tiny, tmp_path, monkeypatch):
-    """A copy of a dataset, and predictions of it, in the current folder."""
+def predicted(copied, tmp_path, monkeypatch):
+    """A copy of a dataset, ``copy``, and predictions of it, in the current folder."""
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(tiny, "data")
-    assert (
-        main(["predict", "constant", "data", "--split", "validation", "--out", "predictions"]) == 0
-    )
+    assert fpp_bench("predict constant copy --split validation --out predictions") == 0
+
+
+BUILD = "build --workers 1 --size 176 --objects mug,cork,bowl,power_drill --out"
+VALIDATION = "--split validation"
 
 
 def score(*words):
-    status = fpp_eval(["predictions", *words, "--json", "result.json"])
-    return status, json.loads(Path("result.json").read_text()) if status == 0 else None
+    return fpp_eval("predictions", *words, "--json result.json")
 
 
 def test_predictions_say_what_was_predicted(predicted, tmp_path, monkeypatch):
     block = yaml.safe_load(Path("predictions/submission.yaml").read_text())["predicted"]
-    assert block["dataset"] == str(tmp_path / "data") and block["split"] == "validation"
+    assert block["dataset"] == str(tmp_path / "copy") and block["split"] == "validation"
     assert {"validation/frame_00", "validation/depth", "validation/flags"} <= set(block["content"])
-    status, result = score()
-    assert (
-        status == 0
-        and result["dataset"]["split"] == "validation"
-        and "predicted" not in result["submission"]
-    )
-    assert result["metrics"] == score("data", "--split", "validation")[1]["metrics"]
-    assert score("data")[1]["dataset"]["split"] == "validation"
-    assert score("--split", "test")[0] == 2  # those were not predicted
+    results = []
+    for words in ("", f"copy {VALIDATION}", "copy"):
+        assert score(words) == 0
+        results.append(read_json(Path("result.json")))
+        assert results[-1]["dataset"]["split"] == "validation"
+        assert results[-1]["metrics"] == results[0]["metrics"]
+    assert "predicted" not in results[0]["submission"]
+    assert score("--split test") == 2  # those were not predicted
     monkeypatch.chdir("/")
-    assert fpp_eval([str(tmp_path / "predictions")]) == 0
+    assert fpp_eval(tmp_path / "predictions") == 0
 
 
-def test_a_dataset_that_was_moved_is_asked_for(predicted, capsys):
-    Path("data").rename("elsewhere")
-    assert score()[0] == 2
-    error = capsys.readouterr().err
-    assert (
-        "data: no such folder" in error
-        and "if the data was moved, give the dataset: fpp-eval predictions DATASET" in error
-    )
-    assert score("elsewhere")[0] == 0
+def test_a_dataset_that_was_moved_is_asked_for(predicted):
+    Path("copy").rename("elsewhere")
+    error = refusal(score)
+    assert "copy: no such folder" in error
+    assert "if the data was moved, give the dataset: fpp-eval predictions DATASET" in error
+    assert score("elsewhere") == 0
 
 
-def test_a_dataset_that_was_changed_is_refused(predicted, capsys):
-    shutil.rmtree("data")
-    words = [
-        "--objects",
-        "mug,cork,bowl,power_drill",
-        "--size",
-        "176",
-        "--seed",
-        "1",
-        "--workers",
-        "1",
-    ]
-    assert main(["build", "--out", "data", *words]) == 0
-    assert score()[0] == 2
-    error = capsys.readouterr().err
+def test_a_dataset_that_was_changed_is_refused(predicted):
+    shutil.rmtree("copy")
+    assert fpp_bench(BUILD, "copy --seed 1") == 0
+    error = refusal(score)
     assert "is not what predictions was predicted from, validation/frame_00 is another now" in error
     assert "give the dataset: fpp-eval predictions DATASET, or predict again" in error
 
 
-def test_a_description_by_hand_needs_the_dataset(tmp_path, monkeypatch, capsys):
+def test_a_description_by_hand_needs_the_dataset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    dataset = make_dataset(tmp_path / "data")
-    write_predictions(tmp_path / "predictions", dataset)
-    assert score()[0] == 2
-    assert (
-        "does not say (predicted:) what was predicted; give the dataset: fpp-eval predictions "
-        "DATASET" in capsys.readouterr().err
-    )
-    assert score("data")[0] == 0
+    write_predictions(tmp_path / "predictions", make_dataset(tmp_path / "data"))
+    said = "(predicted:) what was predicted; give the dataset: fpp-eval predictions DATASET"
+    assert said in refusal(score)
+    assert score("data") == 0
 
 
-def test_a_slip_in_the_name_of_a_command_is_no_folder(tmp_path, monkeypatch, capsys):
+def test_a_slip_in_the_name_of_a_command_is_no_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert fpp_eval(["chek", "predictions"]) == 2
-    assert "unknown command 'chek'; did you mean 'check'?" in capsys.readouterr().err
+    said = refusal(fpp_eval, "chek predictions")
+    assert "unknown command 'chek'; did you mean 'check'?" in said
     Path("chek").mkdir()
-    assert fpp_eval(["chek", "data"]) == 2
-    assert (
-        "can't be scored" not in (error := capsys.readouterr().err)
-        and "unknown command" not in error
-    )
+    error = refusal(fpp_eval, "chek data")
+    assert "can't be scored" not in error and "unknown command" not in error
 
 
 def test_click_is_told_to_take_no_defaults_from_the_environment(monkeypatch):
@@ -364,42 +324,19 @@ def test_click_is_told_to_take_no_defaults_from_the_environment(monkeypatch):
     assert np.isfinite(shoot.values(context)["lens"].focal)
 
 
-def test_predictions_of_another_dataset_are_refused(predicted, capsys, tmp_path):
-    words = [
-        "--objects",
-        "mug,cork",
-        "--size",
-        "176",
-        "--pitch",
-        "24",
-        "--config",
-        "single_shot",
-        "--workers",
-        "1",
-    ]
-    assert main(["build", "--out", "other", *words]) == 0
-    capsys.readouterr()
-    assert score("other", "--split", "validation") == (2, None)
-    error = capsys.readouterr().err
+def test_predictions_of_another_dataset_are_refused(predicted):
+    line = "build --out other --objects mug,cork --size 176 --pitch 24 --workers 1"
+    assert fpp_bench(line, "--config single_shot") == 0
+    error = refusal(score, "other", VALIDATION)
     assert (
         "other: is not what predictions was predicted from, validation/frame_00 is another now"
         in error
     )
     description = yaml.safe_load(Path("predictions/submission.yaml").read_text())
     write_description(Path("predictions"), **{**description, "predicted": ...})
-    assert score("other", "--split", "validation")[0] == 0  # it says nothing
+    assert score("other", VALIDATION) == 0  # it says nothing
 
 
 def test_the_same_data_with_fewer_frames_are_scored(predicted):
-    words = [
-        "--objects",
-        "mug,cork,bowl,power_drill",
-        "--size",
-        "176",
-        "--config",
-        "single_shot",
-        "--workers",
-        "1",
-    ]
-    assert main(["build", "--out", "fewer", *words]) == 0
-    assert score("fewer", "--split", "validation")[0] == 0
+    assert fpp_bench(BUILD, "fewer --config single_shot") == 0
+    assert score("fewer", VALIDATION) == 0

@@ -5,16 +5,17 @@ import io
 import re
 
 import pytest
+from conftest import fpp_bench
 from rich.console import Console
 from rich.text import Text
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report.comparison import compare as compare_results
 from fpp_ml_bench.evaluation.report.terminal import comparison_table, result_table
 from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
 from fpp_ml_bench.leaderboard.ranking import rank as rank_files
 from fpp_ml_bench.leaderboard.ranking import read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.tables import chosen_tables, group_tables, paper_rich_tables
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.tables import Table
 
 WIDTHS = (80, 120, 200)
@@ -24,8 +25,7 @@ WIDTHS = (80, 120, 200)
 def result(tiny, tmp_path_factory):
     """Of a method that states its uncertainty."""
     folder = tmp_path_factory.mktemp("scored") / "predictions"
-    assert main(["predict", "classical", str(tiny), "--out", str(folder)]) == 0
-    from fpp_ml_bench.loaders.storage.store import DatasetFolder
+    assert fpp_bench("predict classical", tiny, "--out", folder) == 0
 
     scored = evaluate_folder(folder, DatasetFolder(tiny), "test")
     assert scored.uncertainty is not None

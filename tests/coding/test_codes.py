@@ -6,53 +6,34 @@ import math
 import cv2
 import numpy as np
 import pytest
+import yaml
+from captures import rig_with
 
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image
-from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 from fpp_ml_bench.optics.sequence import SCHEMES, CodedSequence, code_from_dict
 
 LENGTH = 912
 LIMITS = Limits()
-CODES = {
-    "unit cue": {"scheme": "phase-shift", "pitches_px": [57, 912], "steps": 3, "sign": -1},
-    "hierarchy": {"scheme": "phase-shift", "pitches_px": [1000, 200, 25], "steps": [4, 4, 6]},
-    "heterodyne": {"scheme": "phase-shift", "pitches_px": [42, 45, 48], "steps": 4},
-    "number-theoretical": {"scheme": "phase-shift", "pitches_px": [29, 33], "steps": 5},
-    "own shifts": {
-        "scheme": "phase-shift",
-        "pitch_px": 24,
-        "shifts_deg": [0, 90, 200, 250],
-        "gray": {},
-    },
-    "whole-period cells": {
-        "scheme": "phase-shift",
-        "pitch_px": 24,
-        "steps": 4,
-        "gray": {"cell_px": 24},
-    },
-    "inverses": {
-        "scheme": "phase-shift",
-        "pitch_px": 36,
-        "steps": 3,
-        "gray": {"inverse": "after all"},
-    },
-    "origin": {"scheme": "phase-shift", "pitches_px": [60, 920], "steps": 4, "origin_px": -3.5},
-    "gray alone": {"scheme": "gray", "cell_px": 2},
-    "gray in pairs": {"scheme": "gray", "cell_px": 4, "inverse": "after each", "least_first": True},
-    "gray centred": {"scheme": "gray", "cell_px": 1, "bits": 10, "origin_px": -56},
-    "cells of another origin": {
-        "scheme": "phase-shift",
-        "pitch_px": 18,
-        "steps": 6,
-        "gray": {"origin_px": -4.5, "least_first": True},
-    },
-    "the paper's": {"scheme": "phase-shift", "pitch_px": 18, "steps": 18, "gray": {}},
-}
+CODES = yaml.safe_load("""
+unit cue: {scheme: phase-shift, pitches_px: [57, 912], steps: 3, sign: -1}
+hierarchy: {scheme: phase-shift, pitches_px: [1000, 200, 25], steps: [4, 4, 6]}
+heterodyne: {scheme: phase-shift, pitches_px: [42, 45, 48], steps: 4}
+number-theoretical: {scheme: phase-shift, pitches_px: [29, 33], steps: 5}
+own shifts: {scheme: phase-shift, pitch_px: 24, shifts_deg: [0, 90, 200, 250], gray: {}}
+whole-period cells: {scheme: phase-shift, pitch_px: 24, steps: 4, gray: {cell_px: 24}}
+inverses: {scheme: phase-shift, pitch_px: 36, steps: 3, gray: {inverse: after all}}
+origin: {scheme: phase-shift, pitches_px: [60, 920], steps: 4, origin_px: -3.5}
+gray alone: {scheme: gray, cell_px: 2}
+gray in pairs: {scheme: gray, cell_px: 4, inverse: after each, least_first: true}
+gray centred: {scheme: gray, cell_px: 1, bits: 10, origin_px: -56}
+cells of another origin:
+  {scheme: phase-shift, pitch_px: 18, steps: 6, gray: {origin_px: -4.5, least_first: true}}
+the paper's: {scheme: phase-shift, pitch_px: 18, steps: 18, gray: {}}
+""")
 
 
 def code_of(name):
@@ -62,16 +43,10 @@ def code_of(name):
 def seen(code, position_px, mean=120.0, amplitude=100.0, noise=0.0, seed=0):
     """Grey levels at sub-pixel positions of the patterns, with black and white where the code needs
     them."""
-    levels = np.stack(
-        [
-            np.interp(position_px, np.arange(LENGTH), row)
-            for row in code.profiles(LENGTH).astype(float)
-        ]
-    )
+    profiles = code.profiles(LENGTH).astype(float)
     if code.needs_flat:
-        levels = np.concatenate(
-            [levels, np.zeros((1, len(position_px))), np.full((1, len(position_px)), 255.0)]
-        )
+        profiles = np.vstack([profiles, np.zeros(LENGTH), np.full(LENGTH, 255.0)])
+    levels = np.stack([np.interp(position_px, np.arange(LENGTH), row) for row in profiles])
     grey = mean + amplitude * (levels / 127.5 - 1)
     return (grey + np.random.default_rng(seed).normal(0, noise, grey.shape)).astype(np.float32)
 
@@ -103,11 +78,8 @@ def test_noise_is_what_the_code_says_and_no_order_slips(name):
 
 def test_gray_frames_are_opencvs():
     frames = GrayCells(1, 10, "after each").profiles(912)
-    generator = cv2.structured_light.GrayCodePattern.create(912, 4)
-    done, patterns = generator.generate()
-    assert done
-    columns = np.array([pattern[0] for pattern in patterns[:20]])
-    assert np.array_equal(frames, columns)
+    done, patterns = cv2.structured_light.GrayCodePattern.create(912, 4).generate()
+    assert done and np.array_equal(frames, [pattern[0] for pattern in patterns[:20]])
 
 
 def test_cells_begin_at_their_origin_and_either_bit_comes_first():
@@ -134,7 +106,7 @@ def test_a_rig_dictionary_names_only_what_is_unusual():
 
 
 def test_pairs_need_no_white_and_black():
-    rig = rig_from_dict(coded_rig(vertical=CODES["gray in pairs"], order=["vertical"]))
+    rig = coded_rig(vertical=CODES["gray in pairs"], order=["vertical"])
     code = rig.code("vertical")
     assert len(rig.sequence) == 16 and not code.needs_flat and code_of("gray alone").needs_flat
     levels = seen(code, np.full(4, 301.5))
@@ -168,14 +140,15 @@ def test_dark_saturated_and_contradicting_pixels_have_their_reason():
 
 
 def test_a_single_period_shorter_than_the_pattern_has_no_order():
-    code = code_from_dict({"scheme": "phase-shift", "pitch_px": 57, "steps": 4}, LENGTH, "code")
-    assert (
-        code.decode(seen(code, np.array([100.0, 500.0])), LENGTH, LIMITS).reason
-        == Reason.INCONSISTENT_ORDER
-    ).all()
-    whole = code_from_dict({"scheme": "phase-shift", "pitch_px": 912, "steps": 4}, LENGTH, "code")
-    found = whole.decode(seen(whole, np.array([100.0, 500.0])), LENGTH, LIMITS)
-    np.testing.assert_allclose(found.coordinate_px, [100, 500], atol=0.6)
+    position = np.array([100.0, 500.0])
+
+    def found(pitch_px):
+        wave = {"scheme": "phase-shift", "pitch_px": pitch_px, "steps": 4}
+        code = code_from_dict(wave, LENGTH, "code")
+        return code.decode(seen(code, position), LENGTH, LIMITS)
+
+    assert (found(57).reason == Reason.INCONSISTENT_ORDER).all()
+    np.testing.assert_allclose(found(912).coordinate_px, position, atol=0.6)
 
 
 def test_fewer_than_three_steps_are_no_phase():
@@ -185,30 +158,24 @@ def test_fewer_than_three_steps_are_no_phase():
         code.decode(np.zeros((1, 5), np.uint8), LENGTH, LIMITS)
 
 
-def coded_rig(**sequence) -> dict:
-    data = paper_rig(64).to_dict()
-    del data["pitch_px"], data["background_m"], data["standoff_m"]
-    return {**data, "sequence": sequence}
+def coded_rig(**sequence):
+    return rig_with(sequence, 64, background_m=..., standoff_m=...)
 
 
 @pytest.mark.parametrize("name", CODES)
 def test_a_rig_file_holds_every_code(name, tmp_path):
-    order = ["white", "vertical", "black"]
-    rig = rig_from_dict(coded_rig(order=order, vertical=CODES[name]))
+    rig = coded_rig(order=["white", "vertical", "black"], vertical=CODES[name])
     save_rig(rig, tmp_path / "rig.yaml")
     assert load_rig(tmp_path / "rig.yaml") == rig
-    assert (
-        isinstance(rig.sequence, CodedSequence)
-        and rig.directions == ("vertical",)
-        and rig.background_m is None
-    )
+    assert isinstance(rig.sequence, CodedSequence) and rig.directions == ("vertical",)
+    assert rig.background_m is None
     assert len(rig.sequence) == len(rig.code("vertical").shown) + 2 and rig.sequence.white == 0
     assert np.array_equal(pattern_image(rig, 1)[0], rig.code("vertical").profiles(912)[0])
     assert rig.code("vertical").scheme in SCHEMES
 
 
 def test_a_direction_that_is_not_projected_is_named():
-    rig: Rig = rig_from_dict(coded_rig(vertical=CODES["unit cue"]))
+    rig = coded_rig(vertical=CODES["unit cue"])
     assert rig.pitch("vertical") == 57 and rig.standoff_m == 1.8
     with pytest.raises(RigError, match="vertical fringes, and no horizontal ones"):
         rig.pitch("horizontal")
@@ -218,79 +185,44 @@ def test_a_direction_that_is_not_projected_is_named():
 
 def test_single_frames_are_described_and_made_but_not_decoded_pixel_by_pixel():
     x = np.arange(912)
-    rig = rig_from_dict(coded_rig(vertical={"scheme": "composite", "pitches_px": [18, 22]}))
+    rig = coded_rig(vertical={"scheme": "composite", "pitches_px": [18, 22]})
     expected = 127.5 + 63.75 * (np.cos(2 * np.pi * x / 18) + np.cos(2 * np.pi * x / 22))
     assert np.abs(pattern_image(rig, 0)[0] - expected).max() <= 0.51 and rig.pitch("vertical") == 18
     with pytest.raises(DecodeError, match="pixel by pixel"):
         rig.code("vertical").decode(np.zeros((1, 4), np.uint8), LENGTH, LIMITS)
 
 
+WAVE = "vertical: {scheme: phase-shift, pitch_px: 18"
+
+
 @pytest.mark.parametrize(
-    "sequence, said",
+    "text, said",
     [
-        ({"order": ["vertical"]}, "no direction is coded"),
-        ({"vertical": {"scheme": "magic"}}, "vertical.scheme: expected phase-shift, gray"),
-        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18}}, "steps: missing"),
+        ("order: [vertical]", "no direction is coded"),
+        ("vertical: {scheme: magic}", "vertical.scheme: expected phase-shift, gray"),
+        (f"{WAVE}}}", "steps: missing"),
+        (f"{WAVE}, steps: 3, sign: 0}}", "sign: expected 1"),
+        (f"{WAVE}, steps: 3, colour: 1}}", "colour: unknown key"),
+        (f"{WAVE}, steps: 3, shifts_deg: [0]}}", "not both"),
         (
-            {"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": 0}},
-            "sign: expected 1",
-        ),
-        (
-            {"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "colour": 1}},
-            "colour: unknown key",
-        ),
-        (
-            {"vertical": {"scheme": "phase-shift", "pitch_px": 18, "shifts_deg": [0], "steps": 3}},
-            "not both",
-        ),
-        (
-            {"vertical": {"scheme": "phase-shift", "pitches_px": [18, 36], "steps": [3]}},
+            "vertical: {scheme: phase-shift, pitches_px: [18, 36], steps: [3]}",
             "each of 2 periods",
         ),
+        (f"{WAVE}, steps: 3, gray: {{bits: 2}}}}", "need 7 bits"),
+        (f"{WAVE}, steps: 3, gray: {{cell_px: 20}}}}", "exceed"),
+        ("{vertical: {scheme: gray, inverse: 'yes'}, order: [vertical]}", "inverse: expected none"),
+        ("{vertical: {scheme: gray}, order: [vertical]}", "black, white missing"),
+        ("vertical: {scheme: gray, origin_px: 1}", "vertical.origin_px: expected 0 or less"),
         (
-            {
-                "vertical": {
-                    "scheme": "phase-shift",
-                    "pitch_px": 18,
-                    "steps": 3,
-                    "gray": {"bits": 2},
-                }
-            },
-            "need 7 bits",
-        ),
-        (
-            {
-                "vertical": {
-                    "scheme": "phase-shift",
-                    "pitch_px": 18,
-                    "steps": 3,
-                    "gray": {"cell_px": 20},
-                }
-            },
-            "exceed",
-        ),
-        (
-            {"vertical": {"scheme": "gray", "inverse": "yes"}, "order": ["vertical"]},
-            "inverse: expected none",
-        ),
-        ({"vertical": {"scheme": "gray"}, "order": ["vertical"]}, "black, white missing"),
-        (
-            {"vertical": {"scheme": "gray", "origin_px": 1}},
-            "vertical.origin_px: expected 0 or less",
-        ),
-        (
-            {"vertical": {"scheme": "gray", "origin_px": -113, "bits": 10}},
+            "vertical: {scheme: gray, origin_px: -113, bits: 10}",
             "hold 1025 Gray cells.*need 11 bits",
         ),
-        ({"vertical": CODES["unit cue"], "order": ["vertical", "vertical"]}, "at most once"),
-        (
-            {"vertical": CODES["unit cue"], "order": ["horizontal"]},
-            "expected each of vertical, black, white",
-        ),
-        ({"vertical": {"scheme": "composite", "pitches_px": [18]}}, "two periods and more"),
-        ({"vertical": {"scheme": "composite", "pitches_px": [18, 2]}}, "4 px and more"),
+        (f"{WAVE}, steps: 3}}\norder: [vertical, vertical]", "at most once"),
+        (f"{WAVE}, steps: 3}}\norder: [horizontal]", "expected each of vertical, black, white"),
+        ("vertical: {scheme: composite, pitches_px: [18]}", "two periods and more"),
+        ("vertical: {scheme: composite, pitches_px: [18, 2]}", "4 px and more"),
     ],
 )
-def test_a_sequence_that_is_none_is_refused(sequence, said):
+def test_a_sequence_that_is_none_is_refused(text, said):
     with pytest.raises(RigError, match=said):
-        rig_from_dict(coded_rig(**sequence))
+        coded_rig(**yaml.safe_load(text))

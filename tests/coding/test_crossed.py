@@ -3,14 +3,14 @@ of frames."""
 
 import numpy as np
 import pytest
+from captures import rig_with
 
 from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image, pattern_profile
-from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 from fpp_ml_bench.optics.sequence import CodedSequence
 
 FAMILY = {
@@ -21,23 +21,21 @@ FAMILY = {
 }
 
 
-def rig_of(**sequence) -> dict:
-    data = paper_rig(64).to_dict()
-    del data["pitch_px"]
-    return {**data, "sequence": sequence}
+def rig_of(**sequence):
+    return rig_with(sequence, 64)
 
 
 def test_each_frame_is_the_sum_of_two_shifted_carriers():
     family = Crossed.from_entries(FAMILY)
     v, u = np.mgrid[:40, :50]
-    for n, (first_shift, second_shift) in enumerate(FAMILY["shifts_deg"]):
-        first = (
-            v * np.cos(np.radians(30)) + u * np.sin(np.radians(30))
-        ) / 18 * 2 * np.pi + np.radians(first_shift)
-        second = (v * np.cos(np.radians(100)) + u * np.sin(np.radians(100))) / 14.5 * 2 * np.pi
-        expected = 127.5 + 127.5 * (
-            0.6 * np.cos(first) + 0.3 * np.cos(second + np.radians(second_shift))
-        )
+    for n, shifts_deg in enumerate(FAMILY["shifts_deg"]):
+        expected = np.full((40, 50), 127.5)
+        for pitch_px, angle_deg, weight, shift_deg in zip(
+            FAMILY["pitches_px"], FAMILY["angles_deg"], FAMILY["weights"], shifts_deg, strict=True
+        ):
+            angle = np.radians(angle_deg)
+            along = (v * np.cos(angle) + u * np.sin(angle)) / pitch_px
+            expected += 127.5 * weight * np.cos(2 * np.pi * along + np.radians(shift_deg))
         image = family.image(50, 40, n)
         assert image.dtype == np.uint8 and image.shape == (40, 50)
         assert np.abs(image - expected).max() <= 0.5 + 1e-9
@@ -52,7 +50,7 @@ def test_a_rig_file_holds_crossed_fringes_beside_codes_or_alone(tmp_path):
         {"crossed": FAMILY},
         {"order": ["crossed", "vertical", "black"], "crossed": FAMILY, "vertical": wave},
     ):
-        rig = rig_from_dict(rig_of(**sequence))
+        rig = rig_of(**sequence)
         save_rig(rig, tmp_path / "rig.yaml")
         assert load_rig(tmp_path / "rig.yaml") == rig
         indices = rig.sequence.config("crossed")
@@ -60,7 +58,7 @@ def test_a_rig_file_holds_crossed_fringes_beside_codes_or_alone(tmp_path):
         assert rig.sequence.config("single_shot") == indices[:1]
         for n, index in enumerate(indices):
             assert np.array_equal(pattern_image(rig, index), rig.crossed.image(912, 1140, n))
-    alone: Rig = rig_from_dict(rig_of(crossed=FAMILY))
+    alone = rig_of(crossed=FAMILY)
     assert alone.directions == () and alone.crossed == Crossed.from_entries(FAMILY)
     with pytest.raises(DecodeError, match="crossed fringes alone can't be decoded"):
         decode_stack(np.zeros((2, 64, 64), np.uint8), alone)
@@ -94,7 +92,7 @@ def test_the_crossed_rig_is_the_papers_with_three_frames_before_its_own():
 def test_a_pair_of_frames_makes_the_crossed_frame_of_its_family():
     assert Crossed.of_pair(paper_rig()) == Crossed((18.0, 18.0))
     wave = {"scheme": "phase-shift", "pitch_px": 57, "shifts_deg": [30, 150, 270], "origin_px": 5}
-    rig = rig_from_dict(rig_of(horizontal=wave, vertical={**wave, "pitch_px": 48, "origin_px": 0}))
+    rig = rig_of(horizontal=wave, vertical={**wave, "pitch_px": 48, "origin_px": 0})
     made = crossed_from_pair(pattern_image(rig, 0), pattern_image(rig, 3))
     assert made.dtype == np.uint8
     assert np.abs(made.astype(int) - Crossed.of_pair(rig).image(912, 1140, 0)).max() <= 1
@@ -116,13 +114,20 @@ def test_a_pair_of_frames_makes_the_crossed_frame_of_its_family():
 )
 def test_a_family_that_is_none_is_refused(changes, said):
     with pytest.raises(RigError, match=said):
-        rig_from_dict(rig_of(crossed={**FAMILY, **changes}))
+        rig_of(crossed={**FAMILY, **changes})
 
 
-def test_an_order_that_does_not_fit_is_refused():
-    with pytest.raises(RigError, match="crossed missing"):
-        rig_from_dict(rig_of(order=["black"], crossed=FAMILY))
-    with pytest.raises(RigError, match="expected each of crossed, black, white at most once"):
-        rig_from_dict(rig_of(order=["crossed", "vertical"], crossed=FAMILY))
-    with pytest.raises(RigError, match="crossed: expected a mapping with the keys pitches_px"):
-        rig_from_dict(rig_of(crossed=3))
+@pytest.mark.parametrize(
+    "sequence, said",
+    [
+        ({"order": ["black"], "crossed": FAMILY}, "crossed missing"),
+        (
+            {"order": ["crossed", "vertical"], "crossed": FAMILY},
+            "expected each of crossed, black, white at most once",
+        ),
+        ({"crossed": 3}, "crossed: expected a mapping with the keys pitches_px"),
+    ],
+)
+def test_an_order_that_does_not_fit_is_refused(sequence, said):
+    with pytest.raises(RigError, match=said):
+        rig_of(**sequence)

@@ -18,15 +18,6 @@ from fpp_ml_bench.coding.gray_code import (
 from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, equal_shifts
 
 
-def test_code_is_the_reflected_code():
-    # Built by reflection, which is how the code is defined.
-    code = [0, 1]
-    while len(code) < 1024:
-        code += [value + len(code) for value in reversed(code)]
-    assert binary_to_gray(np.arange(1024)).tolist() == code
-    assert gray_to_binary(code).tolist() == list(range(1024))
-
-
 @pytest.mark.parametrize(
     "length, pitch, cells, bits",
     [
@@ -53,14 +44,14 @@ def test_centres_are_the_means_of_the_pixels(pitch):
     np.testing.assert_allclose(cell_centres_rad(length, pitch), expected, atol=1e-12)
 
 
-def decoded(levels, pitch, length, steps):
-    """What the code of a period in equal steps and Gray code in half periods makes of grey levels
-    (frames, n)."""
-    return code_of(pitch, len(levels) - steps, steps).decode(levels, length, Limits())
-
-
 def code_of(pitch, bits, steps):
+    """A period in equal steps, and Gray code in half periods."""
     return PhaseShift((Fringes(pitch, equal_shifts(steps, 1)),), 0.0, GrayCells(pitch / 2, bits))
+
+
+def decoded(levels, pitch, steps):
+    """What the code makes of grey levels (frames, n)."""
+    return code_of(pitch, len(levels) - steps, steps).decode(levels, 912, Limits())
 
 
 def captured_at(u, pitch, blur_px, noise, modulation, gray_shift_px=0.0):
@@ -85,7 +76,7 @@ def captured_at(u, pitch, blur_px, noise, modulation, gray_shift_px=0.0):
 )
 def test_no_position_ever_slips_a_period(pitch, blur_px, noise, modulation):
     u = np.arange(2, 909, 0.0137)
-    measured = decoded(captured_at(u, pitch, blur_px, noise, modulation), pitch, 912, 18)
+    measured = decoded(captured_at(u, pitch, blur_px, noise, modulation), pitch, 18)
     trusted = measured.reason == Reason.DECODED
     assert (
         np.abs(measured.coordinate_px - u)[trusted].max() < pitch / 8
@@ -98,7 +89,7 @@ def test_code_edges_may_be_off_by_almost_a_quarter_period(shift):
     """Misread cells at the edges: displaced by up to 4 px of 18, under a quarter period (4.5 px),
     no order is wrong."""
     u = np.arange(6, 900, 0.05)
-    measured = decoded(captured_at(u, 18, 1.0, 0.5, 60.0, gray_shift_px=shift), 18, 912, 18)
+    measured = decoded(captured_at(u, 18, 1.0, 0.5, 60.0, gray_shift_px=shift), 18, 18)
     assert np.abs(measured.coordinate_px - u).max() < 1.0
 
 
@@ -126,7 +117,7 @@ def test_phase_on_the_far_side_of_the_circle_and_cells_off_the_pattern_are_rejec
     far = levels_of(cell_centres_rad(912, 18) + 0.9 * np.pi, np.arange(102))
     beyond = levels_of(np.zeros(2), np.array([102, 127]))
     for levels in (far, beyond):
-        assert (decoded(levels, 18, 912, 4).reason == Reason.INCONSISTENT_ORDER).all()
+        assert (decoded(levels, 18, 4).reason == Reason.INCONSISTENT_ORDER).all()
 
 
 def levels_of(phase, cell):

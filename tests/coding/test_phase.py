@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fpp_ml_bench.coding.phase_shift import choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.decoding.blocks import CLIPPED_STEPS_DIVISOR
@@ -51,25 +49,6 @@ def test_plus_pi_comes_out_as_minus_pi(dtype):
     assert wrapped.phase[0, 0] == np.float32(-np.pi)
 
 
-@given(
-    st.lists(st.floats(0, 6.28), min_size=3, max_size=9), st.floats(-3.1, 3.1), st.floats(1, 120)
-)
-@settings(max_examples=150, deadline=None)
-def test_any_shifts_that_determine_a_phase_give_it_and_the_others_are_refused(
-    shifts, phase, modulation
-):
-    condition = np.linalg.cond(
-        np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
-    )
-    if condition > 1e6:
-        with pytest.raises(DecodeError, match="don't determine"):
-            phase_weights(shifts)
-        return
-    wrapped = wrapped_phase(frames_of([[phase]], shifts, modulation=modulation), shifts)
-    tolerance = 1e-12 * condition**2 * 200 / modulation
-    assert abs(np.angle(np.exp(1j * (wrapped.phase[0, 0] - phase)))) < tolerance
-
-
 @pytest.mark.parametrize("count", range(3, 19))
 def test_chosen_steps_are_distinct_even_and_sufficient(count):
     chosen = choose_steps(18, count)
@@ -115,6 +94,7 @@ def test_the_clipping_that_the_decoder_allows_moves_the_phase_by_under_five_mrad
         (np.zeros((3, 3, 3)), {"dtype": np.float16}, "float32 or float64"),
         (np.zeros((3, 3, 3)), {"shifts_rad": [0, 1, 2, 3]}, "each of the 3 frames, got 4"),
         (np.zeros((3, 3, 3)), {"shifts_rad": [0, 1, np.nan]}, "finite"),
+        (np.zeros((3, 3, 3)), {"shifts_rad": [0, 1e-9, 2e-9]}, "don't determine"),
     ],
 )
 def test_frames_that_hold_no_phase_are_refused(frames, arguments, message):

@@ -1,13 +1,19 @@
 """``--explain`` counts agree with the data, and skipping changes no result."""
 
-import json
 from dataclasses import replace
 
 import pytest
-from conftest import TINY_SIZE, file_bytes, tiny_settings
+from conftest import (
+    TINY_SIZE,
+    file_bytes,
+    fpp_bench,
+    fpp_eval,
+    printed,
+    read_json,
+    refusal,
+    tiny_settings,
+)
 
-from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli import main_eval as evaluate
 from fpp_ml_bench.cli.console import explanation_table, show
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.builder import explain_build
@@ -23,9 +29,8 @@ def _switch(monkeypatch):
     monkeypatch.delenv(SWITCH, raising=False)
 
 
-def lines_of(path):
-    content = json.loads(path.read_text())
-    return content, {line["what"]: line for line in content["left_out"]}
+def lines_of(account):
+    return {line["what"]: line for line in account["left_out"]}
 
 
 def test_the_account_adds_up_and_drops_lines_with_nothing_left_out():
@@ -38,17 +43,15 @@ def test_the_account_adds_up_and_drops_lines_with_nothing_left_out():
         assert not explained("build", "nothing", [rays]).skipping
 
 
-def test_build_and_its_account(tmp_path, capsys):
-    arguments = (
-        f"build --size {TINY_SIZE} --objects cork --config single_shot --workers 1 --out".split()
-    )
-    account = tmp_path / "account.json"
-    assert main([*arguments, str(tmp_path / "on"), "--explain-json", str(account)]) == 0
-    assert "left out" in capsys.readouterr().out
+def test_build_and_its_account(tmp_path):
+    line = f"build --size {TINY_SIZE} --objects cork --config single_shot --workers 1"
+    said = printed(fpp_bench, line, f"--out {tmp_path}/on --explain-json {tmp_path}/account.json")
+    assert "left out" in said
     with skipping(False):
-        assert main([*arguments, str(tmp_path / "off")]) == 0
+        assert fpp_bench(line, f"--out {tmp_path}/off") == 0
     assert file_bytes(tmp_path / "on") == file_bytes(tmp_path / "off")
-    content, lines = lines_of(account)
+    content = read_json(tmp_path / "account.json")
+    lines = lines_of(content)
     rows = DatasetFolder(tmp_path / "on").manifest.samples["train"]
     assert content["skipping"] and len(rows) == 6
     background = lines["empty background again, in one process"]
@@ -105,80 +108,51 @@ def test_a_dataset_of_an_earlier_version_is_refused_in_words(opened):
 
 def test_predictions_scores_and_their_accounts(tiny, tmp_path):
     account = tmp_path / "account.json"
-    for name, options in (("on", ["--explain-json", str(account)]), ("off", [])):
-        with skipping(name == "on"):
-            words = [
-                "predict",
-                "classical",
-                str(tiny),
-                "--out",
-                str(tmp_path / name),
-                "--steps",
-                "4",
-                *options,
-            ]
-            assert main(words) == 0
+    explain = f"--explain-json {account}"
+    predict = f"predict classical {tiny} --steps 4 --out {tmp_path}"
+    with skipping(True):
+        assert fpp_bench(f"{predict}/on {explain}") == 0
+    with skipping(False):
+        assert fpp_bench(f"{predict}/off") == 0
     skipped, complete = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
-    assert (
-        len(skipped) == 6 * 2 + 1
-        and [name for name in skipped if name.endswith(".npy") and skipped[name] != complete[name]]
-        == []
-    )
-    _, lines = lines_of(account)
+    assert len(skipped) == 6 * 2 + 1
+    assert all(skipped[name] == complete[name] for name in skipped if name.endswith(".npy"))
+    lines = lines_of(read_json(account))
     frames = lines["frames that the method does not use"]
-    assert (frames["done"], frames["left_out"]) == (6 * 22, 6 * 30) and frames[
-        "bytes_saved"
-    ] == 180 * PIXELS
-    second_direction = lines["second direction where the first shows no object"]
-    dataset = DatasetFolder(tiny)
-    object_px = sum(row["object_px"] for row in dataset.manifest.samples["test"])
-    assert (
-        0.98 * object_px < second_direction["done"] < 1.05 * object_px
-        and second_direction["done"] + second_direction["left_out"] == 6 * PIXELS
-    )
+    counts = frames["done"], frames["left_out"], frames["bytes_saved"]
+    assert counts == (6 * 22, 6 * 30, 180 * PIXELS)
+    second = lines["second direction where the first shows no object"]
+    rows = DatasetFolder(tiny).manifest.samples["test"]
+    object_px = sum(row["object_px"] for row in rows)
+    assert 0.98 * object_px < second["done"] < 1.05 * object_px
+    assert second["done"] + second["left_out"] == 6 * PIXELS
     scores = []
-    for name, options in (("a.json", ["--explain-json", str(account)]), ("b.json", [])):
-        result = tmp_path / name
-        command = [str(tmp_path / "on"), str(tiny), "--json", str(result), *options]
-        with skipping(name == "a.json"):
-            assert evaluate(command) == 0
-        content = json.loads(result.read_text())
-        scores.append({key: value for key, value in content.items() if key != "created"})
+    for enabled in (True, False):
+        with skipping(enabled):
+            words = f"--json {tmp_path}/result.json {explain if enabled else ''}"
+            assert fpp_eval(tmp_path / "on", tiny, words) == 0
+        scores.append(read_json(tmp_path / "result.json") | {"created": None})
     assert scores[0] == scores[1]
-    _, lines = lines_of(account)
+    lines = lines_of(read_json(account))
     columns = lines["columns that no score needs"]
-    assert (columns["done"], columns["left_out"]) == (6, 6 * 53) and columns[
-        "bytes_saved"
-    ] == 6 * PIXELS * (52 + 4)
+    counts = columns["done"], columns["left_out"], columns["bytes_saved"]
+    assert counts == (6, 6 * 53, 6 * PIXELS * (52 + 4))
     assert lines["depth edges far from the object"]["done"] > object_px
 
 
 def test_the_phase_route_is_counted_by_its_crop(tiny, tmp_path):
     account = tmp_path / "account.json"
-    assert (
-        main(
-            [
-                "predict",
-                "phase",
-                str(tiny),
-                "--out",
-                str(tmp_path / "p"),
-                "--explain-json",
-                str(account),
-            ]
-        )
-        == 0
-    )
-    _, lines = lines_of(account)
+    assert fpp_bench(f"predict phase {tiny} --out {tmp_path}/p --explain-json {account}") == 0
+    lines = lines_of(read_json(account))
     line = lines["local fits and orders far from the object"]
     assert line["done"] + line["left_out"] == 6 * PIXELS and 0.1 < line["share"] < 0.95
     assert lines["frames that the method does not use"]["left_out"] == 6 * 51
 
 
-def test_an_account_that_cannot_be_written_is_refused_before_any_work(tiny, tmp_path, capsys):
-    command = ["predict", "classical", str(tiny), "--out", str(tmp_path / "p"), "--explain-json"]
-    assert main([*command, str(tmp_path / "none" / "a.json")]) == 2
-    assert "--explain-json" in capsys.readouterr().err and not (tmp_path / "p").exists()
+def test_an_account_that_cannot_be_written_is_refused_before_any_work(tiny, tmp_path):
+    words = f"--out {tmp_path}/p --explain-json {tmp_path}/none/a.json"
+    assert "--explain-json" in refusal(fpp_bench, "predict classical", tiny, words)
+    assert not (tmp_path / "p").exists()
 
 
 def test_data_that_was_not_generated_has_no_account(opened):

@@ -5,9 +5,9 @@ import subprocess
 import sys
 
 import pytest
+from conftest import fpp_bench, refusal
 
 from fpp_ml_bench import pool
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import MeshError, PoolError
 from fpp_ml_bench.pool import mapping
 
@@ -108,12 +108,11 @@ def test_what_is_no_address_is_said(fake_ray, address):
         pass
 
 
-def test_an_address_where_nobody_answers(fake_ray, tmp_path, capsys):
+def test_an_address_where_nobody_answers(fake_ray, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    words = ["build", "--out", str(tmp_path / "set"), "--objects", "cork", "--size", "176"]
-    assert main([*words, "--cluster", f"127.0.0.1:{port}"]) == 2
-    assert f"nobody answers at 127.0.0.1:{port} (Connection refused)" in capsys.readouterr().err
+    line = f"build --out {tmp_path}/set --objects cork --size 176 --cluster"
+    said = refusal(fpp_bench, line, f"127.0.0.1:{port}")
+    assert f"nobody answers at 127.0.0.1:{port} (Connection refused)" in said
     assert fake_ray.addresses == []
-    assert main([*words, "--cluster", "x", "--workers", "2"]) == 2
-    assert "give one of them" in capsys.readouterr().err
+    assert "give one of them" in refusal(fpp_bench, line, "x --workers 2")

@@ -4,7 +4,6 @@ import mpmath
 import numpy as np
 import pytest
 
-from fpp_ml_bench.coding.phase_shift import minus_atan2
 from fpp_ml_bench.portable import cosine_of_turns, power, sine_of_turns
 
 mpmath.mp.dps = 50
@@ -39,16 +38,3 @@ def test_power(exponent):
     assert power(np.array([0.0, 1.0]), exponent).tolist() == (
         [1.0, 1.0] if exponent == 0 else [0.0, 1.0]
     )
-
-
-def test_arctangent_of_two_arguments():
-    rng = np.random.default_rng(2)
-    y, x = rng.normal(size=(2, 4000)) * 10.0 ** rng.integers(-8, 8, (2, 4000))
-    y[:9], x[:9] = np.repeat([-1.0, 0.0, 1.0], 3), np.tile([-1.0, 0.0, 1.0], 3)
-    expected = np.array(
-        [
-            float(mpmath.atan2(mpmath.mpf(float(b)), mpmath.mpf(float(a))))
-            for a, b in zip(x, y, strict=True)
-        ]
-    )
-    np.testing.assert_allclose(-minus_atan2(y, x), expected, rtol=4.5e-16, atol=0)

@@ -7,16 +7,18 @@ import re
 import shutil
 import socket
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import pytest
+from conftest import fpp_bench, refusal
 from mutations import ODD, sealed_manifest, sources, tree_outcome
 from published_trees import make_tree
+from scored_dataset import change_json
 from synthetic import assembly, make
 
 from fpp_ml_bench.baselines.run import UNFINISHED_FILE, UnfinishedRun
 from fpp_ml_bench.baselines.training import weights as weights_files
 from fpp_ml_bench.baselines.training.weights import DEPTH_NETWORKS
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import (
     DatasetError,
     FppBenchError,
@@ -114,7 +116,7 @@ TEXTS = {
 }
 
 
-def refusal(source, content):
+def refused(source, content):
     source.file.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(FppBenchError) as error:
         source.read()
@@ -129,7 +131,7 @@ def refusal(source, content):
 def test_hostile_yaml(name, attack, valid):
     """All attacks on one file, and one on each of the others: they have the same reader."""
     text, message = TEXTS[attack]
-    assert re.search(message, refusal(valid[name], text))
+    assert re.search(message, refused(valid[name], text))
 
 
 def test_dates_stay_text_and_numbers_numbers():
@@ -172,20 +174,16 @@ JSON_TEXTS = {
 def test_hostile_json(name, attack, valid):
     """All attacks on one file, and one on each of the others: they have the same reader."""
     text, message = JSON_TEXTS[attack]
-    assert re.search(message, refusal(valid[name], text))
+    assert re.search(message, refused(valid[name], text))
 
 
 def test_json_is_read_as_it_is():
     content = {"a": [1, 2.5, -1e-320, None, True, "é\U0001f600 \n"], "": {}}
-    assert (
-        strict_json(json.dumps(content))
-        == strict_json(json.dumps(content, ensure_ascii=False))
-        == content
-    )
+    for ascii_alone in (True, False):
+        assert strict_json(json.dumps(content, ensure_ascii=ascii_alone)) == content
     assert strict_json("[" * DEEPEST + "]" * DEEPEST)
-    assert strict_json(f'["{"[{," * MOST_VALUES}"]') == [
-        "[{," * MOST_VALUES
-    ]  # of a text nothing is counted
+    text = "[{," * MOST_VALUES  # of a text nothing is counted
+    assert strict_json(f'["{text}"]') == [text]
 
 
 def test_a_result_of_too_many_objects_is_refused_before_anything_is_computed(valid, monkeypatch):
@@ -201,20 +199,12 @@ def test_a_result_of_too_many_objects_is_refused_before_anything_is_computed(val
     ):
         rows = [{**row, "sample": f"s{i}", "object": f"o{i % objects}"} for i in range(samples)]
         content = {**source.content, "per_sample": rows}
-        assert f"at most 1000 objects and 10000 samples, {message}" in refusal(
+        assert f"at most 1000 objects and 10000 samples, {message}" in refused(
             source, json.dumps(content)
         )
 
 
 # ---- files
-
-
-def fifo(path):
-    os.mkfifo(path)
-
-
-def device(path):
-    path.symlink_to("/dev/zero")
 
 
 def endpoint(path):
@@ -223,7 +213,12 @@ def endpoint(path):
         server.bind(path.name)
 
 
-NO_FILES = {"pipe": fifo, "device": device, "folder": lambda path: path.mkdir(), "socket": endpoint}
+NO_FILES = {
+    "pipe": os.mkfifo,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "folder": Path.mkdir,
+    "socket": endpoint,
+}
 
 
 @pytest.mark.parametrize(
@@ -243,12 +238,12 @@ def test_what_is_no_regular_file_is_refused_at_once(name, kind, valid, tmp_path,
     if name in others:
         file, read = tmp_path / others[name][0], others[name][1]
     else:
-        file, read = valid[name].file, valid[name].read
+        file, read = valid[name].file, lambda path: valid[name].read()
         file.unlink(missing_ok=True)
     NO_FILES[kind](file)
     try:
         with pytest.raises(FppBenchError) as error:
-            read(file) if name in others else read()
+            read(file)
     finally:
         file.rmdir() if kind == "folder" else file.unlink()
     assert file.name in str(error.value) or str(file.parent) in str(error.value)
@@ -272,111 +267,66 @@ def test_a_file_that_the_user_names_may_be_a_link_and_one_in_a_folder_of_predict
 
 def test_files_are_bounded_before_they_are_read(tmp_path):
     """A sparse file: no disk is used, and reading it whole would take seconds."""
-    for name, size in (("rig.yaml", 1 << 40), ("c.xml", 1 << 40)):
+    for name, size, error, read in (
+        ("rig.yaml", 1 << 40, RigError, load_rig),
+        ("c.xml", 1 << 40, RigError, read_opencv_calibration),
+        ("r.json", (1 << 26) + 1, SubmissionError, read_result),
+    ):
         with (tmp_path / name).open("wb") as file:
             file.truncate(size)
-        read = read_opencv_calibration if name == "c.xml" else load_rig
-        with pytest.raises(RigError, match=f"{name}: has {size} bytes, expected at most"):
+        with pytest.raises(error, match=f"{name}: has {size} bytes, expected at most"):
             read(tmp_path / name)
-    with (tmp_path / "r.json").open("wb") as file:
-        file.truncate((1 << 26) + 1)
-    with pytest.raises(
-        SubmissionError,
-        match=r"r\.json: has 67108865 bytes, expected at most 67108864 bytes; write",
-    ):
-        read_result(tmp_path / "r.json")
 
 
 # ---- the manifest
 
 
-def changed_manifest(folder, change):
-    """Change the manifest's content, and make its fingerprint right again."""
+def changed_manifest(folder, key, value):
+    """Change a value of the manifest, and make its fingerprint right again."""
     path = folder / "manifest.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(sealed_manifest(content)))
+    change_json(path, key, value)
+    path.write_text(json.dumps(sealed_manifest(json.loads(path.read_text()))))
 
 
-def first_row(**changes):
-    return lambda content: content["samples"]["train"][0].update(changes)
-
-
-def first_shard(**changes):
-    return lambda content: content["shards"][0].update(changes)
-
-
+ROW, SHARD, HASH = "samples.train.0", "shards.0", "0" * 32
+ONE_ROW = [{"sample": "mug_A0", "object": "mug", "view": "A0"}]
 MANIFESTS = {
     "sample is a path": (
-        first_row(sample="../../x"),
+        f"{ROW}.sample",
+        "../../x",
         "sample '../../x': expected a name of letters",
     ),
-    "object is a path": (first_row(object="/etc/passwd"), "object '/etc/passwd': expected a name"),
-    "view is a path": (first_row(view="../x"), "view '../x': expected a name"),
-    "sample too long": (first_row(sample=300 * "a" + "_A0"), "expected a name"),
-    "no object": (
-        lambda content: content["samples"]["test"][0].pop("object"),
-        "object 'None': expected a name",
+    "object is a path": (
+        f"{ROW}.object",
+        "/etc/passwd",
+        "object '/etc/passwd': expected a name",
     ),
-    "pixels are text": (first_row(object_px="many"), "object_px: expected a number, got many"),
-    "error is a list": (first_row(gt_mae_mm=[]), "gt_mae_mm: expected a number"),
-    "shard outside": (first_shard(path="../../etc/passwd"), "without . and .."),
-    "shard with an escape": (first_shard(path="train/\x1b[31m"), r"U\+001B"),
-    "rows below 0": (first_shard(rows=-1), "expected counts of 0 and more"),
-    "no hash": (first_shard(xxh3_128="x"), "a hash of 32 hex digits"),
-    "another key": (first_shard(x=1), "shards: expected exactly the keys path, split"),
-    "shard of no group": (first_shard(group="x"), "unknown group 'x', expected data"),
-    "shard twice": (
-        lambda content: content["shards"].append(content["shards"][0]),
-        "is listed twice",
-    ),
-    "other file outside": (
-        lambda content: content["others"][0].update(path="../x"),
-        "without . and ..",
-    ),
-    "no split": (
-        lambda content: content["samples"].update(holdout=content["samples"]["test"]),
-        "unknown split 'holdout'",
-    ),
-    "empty split": (
-        lambda content: content["samples"].update(test=[]),
-        "expected some in every split",
-    ),
-    "image of no size": (
-        lambda content: content.update(size=[0, 16]),
-        r"expected 1 to 16384 px a side",
-    ),
-    "image too large": (
-        lambda content: content.update(size=[12, 16385]),
-        r"expected 1 to 16384 px a side",
-    ),
-    "another rig": (
-        lambda content: content["rig"]["camera"].update(fx="wide"),
-        "camera.fx: expected a number",
-    ),
-    "stored nothing": (
-        lambda content: content.update(stored="crossed"),
-        "'crossed' is no configuration",
-    ),
-    "exact is a number": (lambda content: content.update(exact=1), "exact: expected bool, got 1"),
-    "light is text": (
-        lambda content: content["settings"].update(light="x"),
-        "settings light: expected a mapping",
-    ),
-    "generator with an escape": (
-        lambda content: content["generator"].update(name="\x1b[31m"),
-        r"U\+001B",
-    ),
-    "another content": (
-        lambda content: content["content"].update({"test/../x": "0" * 32}),
-        "expected split/column",
-    ),
-    "content without hash": (
-        lambda content: content["content"].update({"test/depth": "x"}),
-        "a hash of 32 hex digits",
-    ),
-    "more": (lambda content: content.update(more=1), "expected exactly the keys origin"),
+    "view is a path": (f"{ROW}.view", "../x", "view '../x': expected a name"),
+    "sample too long": (f"{ROW}.sample", 300 * "a" + "_A0", "expected a name"),
+    "no object": ("samples.test.0.object", ..., "object 'None': expected a name"),
+    "pixels are text": (f"{ROW}.object_px", "many", "object_px: expected a number, got many"),
+    "error is a list": (f"{ROW}.gt_mae_mm", [], "gt_mae_mm: expected a number"),
+    "shard outside": (f"{SHARD}.path", "../../etc/passwd", "without . and .."),
+    "shard with an escape": (f"{SHARD}.path", "train/\x1b[31m", r"U\+001B"),
+    "rows below 0": (f"{SHARD}.rows", -1, "expected counts of 0 and more"),
+    "no hash": (f"{SHARD}.xxh3_128", "x", "a hash of 32 hex digits"),
+    "another key": (f"{SHARD}.x", 1, "shards: expected exactly the keys path, split"),
+    "shard of no group": (f"{SHARD}.group", "x", "unknown group 'x', expected data"),
+    "other file outside": ("others.0.path", "../x", "without . and .."),
+    "no split": ("samples.holdout", ONE_ROW, "unknown split 'holdout'"),
+    "empty split": ("samples.test", [], "expected some in every split"),
+    "image of no size": ("size", [0, 16], r"expected 1 to 16384 px a side"),
+    "image too large": ("size", [12, 16385], r"expected 1 to 16384 px a side"),
+    "another rig": ("rig.camera.fx", "wide", "camera.fx: expected a number"),
+    "stored nothing": ("stored", "crossed", "'crossed' is no configuration"),
+    "exact is a number": ("exact", 1, "exact: expected bool, got 1"),
+    "light is text": ("settings.light", "x", "settings light: expected a mapping"),
+    "generator with an escape": ("generator.name", "\x1b[31m", r"U\+001B"),
+    "another content": ("content", {"test/../x": HASH}, "expected split/column"),
+    "content without hash": ("content", {"test/depth": "x"}, "a hash of 32 hex digits"),
+    "more": ("more", 1, "expected exactly the keys origin"),
 }
+"""Key, value, and what is said of it."""
 
 
 @pytest.fixture(scope="module")
@@ -389,38 +339,44 @@ def copied(small, tmp_path):
     return shutil.copytree(small, tmp_path / "here" / "set")
 
 
+def refused_manifest(folder, message):
+    with pytest.raises(DatasetError, match=r"manifest\.json: damaged \(.*" + message):
+        read_manifest(folder)
+
+
 @pytest.mark.parametrize("attack", MANIFESTS)
 def test_a_manifest_that_no_dataset_has(attack, copied):
-    change, message = MANIFESTS[attack]
-    changed_manifest(copied, change)
-    with pytest.raises(DatasetError, match=r"manifest\.json: damaged \(.*" + message):
-        read_manifest(copied)
+    key, value, message = MANIFESTS[attack]
+    changed_manifest(copied, key, value)
+    refused_manifest(copied, message)
 
 
-def test_no_command_writes_or_reads_outside_by_a_manifests_names(copied, tmp_path, capsys):
-    changed_manifest(copied, first_row(sample="../../x"))
-    out = tmp_path / "here" / "out"
-    for command in (
-        ["predict", "phase", copied, "--split", "train", "--out", out],
-        ["export", copied, "--out", out, "--parquet"],
-    ):
-        assert main([str(word) for word in command]) == 2, command
-        assert "manifest.json: damaged (sample '../../x'" in capsys.readouterr().err, command
-    assert sorted(path.name for path in tmp_path.rglob("*x*")) == [] and not out.exists()
+def test_a_manifest_that_lists_a_shard_twice(copied):
+    shards = json.loads((copied / "manifest.json").read_text())["shards"]
+    changed_manifest(copied, "shards", [*shards, shards[0]])
+    refused_manifest(copied, "is listed twice")
 
 
-def test_no_command_follows_a_link_out_of_the_dataset(copied, tmp_path, capsys):
+def refused_by_commands(dataset, out):
+    """What commands say that would write or read by a dataset's names."""
+    for words in (f"predict phase {dataset} --split train", f"export {dataset} --parquet"):
+        yield refusal(fpp_bench, words, "--out", out)
+    assert not out.exists()
+
+
+def test_no_command_writes_or_reads_outside_by_a_manifests_names(copied, tmp_path):
+    changed_manifest(copied, f"{ROW}.sample", "../../x")
+    for said in refused_by_commands(copied, tmp_path / "here" / "out"):
+        assert "manifest.json: damaged (sample '../../x'" in said
+    assert not list(tmp_path.rglob("*x*"))
+
+
+def test_no_command_follows_a_link_out_of_the_dataset(copied, tmp_path):
     shard = copied / read_manifest(copied).shards[0].path
     shutil.move(shard, tmp_path / "elsewhere.arrow")
     shard.symlink_to(tmp_path / "elsewhere.arrow")
-    out = tmp_path / "here" / "out"
-    for command in (
-        ["predict", "phase", copied, "--split", "train", "--out", out],
-        ["export", copied, "--out", out, "--parquet"],
-    ):
-        assert main([str(word) for word in command]) == 2, command
-        assert f"{shard}: is a link out of the dataset" in capsys.readouterr().err, command
-    assert not out.exists()
+    for said in refused_by_commands(copied, tmp_path / "here" / "out"):
+        assert f"{shard}: is a link out of the dataset" in said
     shard.unlink()
     shutil.move(tmp_path / "elsewhere.arrow", copied / "train" / "kept.arrow")
     shard.symlink_to("kept.arrow")
@@ -438,23 +394,18 @@ def test_a_folder_and_any_other_file_may_not_lead_elsewhere_either(name, copied,
         verify(copied)
 
 
-def test_a_mesh_that_the_manifest_does_not_list_is_not_exported(copied, tmp_path, capsys):
+def test_a_mesh_that_the_manifest_does_not_list_is_not_exported(copied, tmp_path):
     (copied / "meshes").mkdir()
     for name in ("bowl", "mug"):
         (copied / "meshes" / f"{name}.ply").symlink_to("/etc/passwd")
-    assert main(["export", str(copied), "--out", str(tmp_path / "out"), "--meshes"]) == 2
-    assert (
-        "bowl.ply: the mesh is missing" in capsys.readouterr().err
-        and not (tmp_path / "out").exists()
-    )
+    said = refusal(fpp_bench, f"export {copied} --out {tmp_path}/out --meshes")
+    assert "bowl.ply: the mesh is missing" in said and not (tmp_path / "out").exists()
 
 
 def test_rows_without_end_are_a_finding_at_once(copied):
-    changed_manifest(copied, first_shard(rows=10**15))
-    assert any(
-        f"the files hold {10**15} rows, expected each of 6 once" in finding
-        for finding in verify(copied)
-    )
+    changed_manifest(copied, f"{SHARD}.rows", 10**15)
+    said = f"the files hold {10**15} rows, expected each of 6 once"
+    assert any(said in finding for finding in verify(copied))
 
 
 # ---- receipts, names from elsewhere

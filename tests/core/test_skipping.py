@@ -29,10 +29,11 @@ def test_the_switch_is_the_environment_and_comes_back(monkeypatch):
     assert not skipping_enabled()
 
 
-SHADY = named_light("paper").changed(
-    "bounces", shadows=True, interreflection=False, ambient_occlusion=False
+SHADY = (
+    named_light("paper")
+    .changed("bounces", shadows=True, interreflection=False, ambient_occlusion=False)
+    .changed("camera", rays_across=1)
 )
-SHADY = SHADY.changed("camera", rays_across=1)
 
 
 def counting(monkeypatch):

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from captures import LENSES, PAPER, capture, tilted
-from conftest import TINY_SIZE
+from conftest import TINY_SIZE, fpp_bench, printed, refusal
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.coding.code import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.fewest import fewest_steps, gray_levels_in_view, orders_from_phases
@@ -30,37 +29,28 @@ def fewest_gray_bits(rig, direction):
     """Gray bits that must be captured for a direction or ``both``, per direction."""
     if direction == "both" and orders_from_phases(rig).unambiguous:
         return {"horizontal": (), "vertical": ()}
-    levels = {
-        name: gray_levels_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")
-    }
     return {
-        name: tuple(bit for bit, level in enumerate(found) if level is None)
-        for name, found in levels.items()
+        name: tuple(
+            bit for bit, level in enumerate(gray_levels_in_view(rig, name)) if level is None
+        )
+        for name in DIRECTIONS
+        if direction in (name, "both")
     }
 
 
 def test_bits_that_are_constant_in_view_are_not_needed():
     # 912 / 20 = 46 cells and 1140 / 18 = 64 cells need 6 bits each, of 7.
-    assert (
-        fewest_gray_bits(COARSE, "vertical")["vertical"]
-        == fewest_gray_bits(COARSE, "horizontal")["horizontal"]
-        == (1, 2, 3, 4, 5, 6)
-    )
-    assert (
-        fewest_gray_bits(PAPER, "vertical")["vertical"]
-        == fewest_gray_bits(PAPER, "horizontal")["horizontal"]
-        == tuple(range(7))
-    )
+    for direction in DIRECTIONS:
+        assert fewest_gray_bits(COARSE, direction)[direction] == (1, 2, 3, 4, 5, 6)
+        assert fewest_gray_bits(PAPER, direction)[direction] == tuple(range(7))
     # In a tenth of the pattern fewer bits change.
     narrow = replace(
         PAPER,
         camera=replace(PAPER.camera, fx=20_000.0, fy=20_000.0),
         working_range_mm=(1790.0, 1810.0),
     )
-    assert (
-        len(fewest_gray_bits(narrow, "vertical")["vertical"]) < 7
-        and fewest_gray_bits(narrow, "vertical")["vertical"][-1] == 6
-    )
+    bits = fewest_gray_bits(narrow, "vertical")["vertical"]
+    assert len(bits) < 7 and bits[-1] == 6
 
 
 def test_two_phases_of_the_papers_rig_by_hand():
@@ -120,9 +110,9 @@ def test_depth_with_the_fewest_frames_is_the_same_bytes(rig, direction, gray):
 
 def test_a_pair_far_from_its_epipolar_line_is_refused_and_a_tight_limit_holds():
     frames = capture(PAPER, tilted(PAPER), noise=25.0)
-    loose = decode_stack(frames, PAPER, steps=3, fewest=True)
-    tight = decode_stack(
-        frames, PAPER, steps=3, fewest=True, limits=Limits(max_disagreement_px=0.1)
+    loose, tight = (
+        decode_stack(frames, PAPER, steps=3, fewest=True, limits=limits)
+        for limits in (Limits(), Limits(max_disagreement_px=0.1))
     )
     assert 0 < (tight.depth_mm > 0).sum() < (loose.depth_mm > 0).sum()
     assert tight.counts["directions_disagree"] > loose.counts["directions_disagree"] > 0
@@ -147,55 +137,25 @@ def test_steps_follow_the_square_root_law():
     assert steps[0.4] == pytest.approx(steps[0.6] * (0.6 / 0.4) ** 2, abs=1.5)
 
 
-def test_predicting_with_the_fewest_frames(tiny, tmp_path, capsys):
+def test_predicting_with_the_fewest_frames(tiny, tmp_path):
     dataset = DatasetFolder(tiny)
     method = ClassicalMethod(dataset.rig, direction="both", steps=3, fewest=True)
-    assert (
-        len(method.frames_used) == 6
-        and method.title == "Classical 3-step, both directions, no Gray code"
-    )
+    assert len(method.frames_used) == 6
+    assert method.title == "Classical 3-step, both directions, no Gray code"
     assert ClassicalMethod(paper_rig(TINY_SIZE), direction="vertical", fewest=True).frames_used == (
         *range(18, 36),
         *dataset.sequence.gray("vertical"),
     )
-    for name, options in (("all", []), ("six", ["--fewest"])):
-        assert (
-            main(
-                [
-                    "predict",
-                    "classical",
-                    str(tiny),
-                    "--out",
-                    str(tmp_path / name),
-                    "--steps",
-                    "3",
-                    *options,
-                ]
-            )
-            == 0
-        )
+    predict = f"predict classical {tiny} --out {tmp_path}"
+    assert fpp_bench(f"{predict}/all --steps 3") == 0
+    assert fpp_bench(f"{predict}/six --steps 3 --fewest") == 0
     for sample in dataset.samples("test"):
         six, twenty = (np.load(tmp_path / name / f"{sample}.npy") for name in ("six", "all"))
         # A pixel of two surfaces, or of bounced light, has no one phase: there the two may differ.
         special = (dataset.flags(sample) & (VOID | Flag.INTERREFLECTION)) > 0
         np.testing.assert_array_equal(six[~special], twenty[~special])
         assert (six != twenty).sum() < 0.005 * six.size
-    command = [
-        "predict",
-        "classical",
-        str(tiny),
-        "--out",
-        str(tmp_path / "noise"),
-        "--depth-noise",
-        "0.8",
-        "--fewest",
-    ]
-    assert main(command) == 0
-    assert "no Gray code" in capsys.readouterr().out
-    for wrong in (
-        ["--depth-noise", "0.001"],
-        ["--depth-noise", "0.8", "--steps", "5"],
-        ["--depth-noise", "-1"],
-    ):
-        assert main(["predict", "classical", str(tiny), "--out", str(tmp_path / "w"), *wrong]) == 2
-        assert "--depth-noise" in capsys.readouterr().err
+    said = printed(fpp_bench, f"{predict}/noise --depth-noise 0.8 --fewest")
+    assert "no Gray code" in said
+    for wrong in ("--depth-noise 0.001", "--depth-noise 0.8 --steps 5", "--depth-noise -1"):
+        assert "--depth-noise" in refusal(fpp_bench, f"{predict}/wrong", wrong)

@@ -38,14 +38,14 @@ def brute_force(rig, crossed, samples=500):
     depths_m = 1 / np.linspace(1 / near_m, 1 / far_m, samples)
     rival, background = np.inf, np.inf
     for x, y in zip(*rig.camera.normalised(columns, rows), strict=True):
-        u, v = rig.project(np.outer(depths_m, [x, y, 1.0]))
+        seen = rig.project(np.outer(depths_m, [x, y, 1.0]))
         middle = rig.project(rig.standoff_m * np.array([x, y, 1.0]))
-        if not (np.isfinite(u).all() and 0 <= middle[0] <= 911 and 0 <= middle[1] <= 1139):
+        if not (np.isfinite(seen[0]).all() and 0 <= middle[0] <= 911 and 0 <= middle[1] <= 1139):
             continue
         behind = rig.project(rig.background_m * np.array([x, y, 1.0]))
-        phases = np.stack([f_u * u + f_v * v for f_u, f_v in crossed.cycles_per_px], axis=1)
-        of_plane = np.array(
-            [f_u * behind[0] + f_v * behind[1] for f_u, f_v in crossed.cycles_per_px]
+        phases, of_plane = (
+            np.stack([f_u * u + f_v * v for f_u, f_v in crossed.cycles_per_px], axis=-1)
+            for u, v in (seen, behind)
         )
         apart = phases[:, None] - phases
         order = np.rint(apart)

@@ -5,18 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from captures import capture, tilted
+from captures import capture, rig_with, tilted
 
 from fpp_ml_bench.examination.examine import examine
-from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import rotation_matrix
-from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 pytestmark = pytest.mark.long
 
-RIG = rig_from_dict(
-    {**paper_rig(200).to_dict(), "sequence": {"steps": 6, "bits_horizontal": 7, "bits_vertical": 7}}
-)
+RIG = rig_with({"steps": 6, "bits_horizontal": 7, "bits_vertical": 7})
 CAMERA = RIG.camera
 
 

@@ -1,16 +1,18 @@
 """The commands patterns and decode, on captures that the renderer makes of a rig with vertical
 codes alone."""
 
-import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+from captures import projected, rig_with, tilted
+from conftest import fpp_bench, printed, read_image, read_json, refusal
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.coding.code import Reason
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import (
@@ -27,50 +29,56 @@ from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 SIZE = 120
+TWO_PERIODS = {"scheme": "phase-shift", "pitches_px": [48, 912], "steps": [4, 8], "sign": -1}
 
 
-def vertical_rig(scheme: dict):
-    data = paper_rig(SIZE).to_dict()
-    del data["pitch_px"]
-    return rig_from_dict(
-        {**data, "sequence": {"vertical": scheme, "order": ["vertical", "white", "black"]}}
-    )
+def vertical_rig(scheme):
+    return rig_with({"vertical": scheme, "order": ["vertical", "white", "black"]}, SIZE)
+
+
+def write(scan, frames, suffix="png", *options):
+    scan.mkdir()
+    for index, frame in enumerate(frames):
+        cv2.imwrite(str(scan / f"frame_{index}.{suffix}"), frame, *options)
+    return scan
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """A mug seen by a rig with two periods of four steps: folder, rig file, exact depth."""
+    """A mug seen by a rig with two periods: folder, frames, exact depth."""
     folder = tmp_path_factory.mktemp("capture")
-    rig = vertical_rig(
-        {"scheme": "phase-shift", "pitches_px": [48, 912], "steps": [4, 8], "sign": -1}
-    )
+    rig = vertical_rig(TWO_PERIODS)
     save_rig(rig, folder / "rig.yaml")
-    studio = Studio(BuildSettings(rig, ("mug",)))
-    row = studio.photograph(solid_mesh("mug"), "A60")
-    (folder / "scan").mkdir()
-    for index, frame in row.frames.items():
-        cv2.imwrite(str(folder / "scan" / f"frame_{index}.png"), frame)
-    return folder, row
+    row = Studio(BuildSettings(rig, ("mug",))).photograph(solid_mesh("mug"), "A60")
+    frames = list(row.frames.values())
+    write(folder / "scan", frames)
+    return folder, frames, row.depth_exact_mm
 
 
-def decode(folder, scan, out, *words):
-    return main(["decode", str(folder / "rig.yaml"), str(scan), "--out", str(out), *words])
+@pytest.fixture
+def scan(capture):
+    return capture[0] / "scan"
 
 
-def test_decoded_capture_is_the_scene(capture, tmp_path, capsys):
-    folder, row = capture
-    assert decode(folder, folder / "scan", tmp_path / "out") == 0
-    depth_mm, exact_mm = np.load(tmp_path / "out" / "depth.npy"), row.depth_exact_mm
-    np.testing.assert_array_equal(
-        depth_mm, decode_stack(list(row.frames.values()), load_rig(folder / "rig.yaml")).depth_mm
-    )
+@pytest.fixture
+def decode(capture, tmp_path):
+    """``fpp-bench decode`` of a folder of frames into the folder ``out``."""
+    return partial(fpp_bench, "decode --out", tmp_path / "out", capture[0] / "rig.yaml")
+
+
+def test_decoded_capture_is_the_scene(capture, scan, decode, tmp_path):
+    folder, frames, exact_mm = capture
+    assert "uncertainty" in printed(decode, scan)
+    depth_mm = np.load(tmp_path / "out" / "depth.npy")
+    expected_mm = decode_stack(frames, load_rig(folder / "rig.yaml")).depth_mm
+    np.testing.assert_array_equal(depth_mm, expected_mm)
     both = (depth_mm > 0) & (exact_mm > 0)
     assert both.sum() > 0.9 * (exact_mm > 0).sum()
     assert np.median(np.abs(depth_mm - exact_mm)[both]) < 2
-    report = json.loads((tmp_path / "out" / "decode.json").read_text())
+    report = read_json(tmp_path / "out" / "decode.json")
     assert report["noise_measured"] and report["pixels"]["decoded"] == (depth_mm > 0).sum()
     assert len(report["frames"]) == 14
     names = {path.name for path in (tmp_path / "out").iterdir()}
@@ -82,21 +90,19 @@ def test_decoded_capture_is_the_scene(capture, tmp_path, capsys):
         "sigma_mm.npy",
         "reason.npy",
     } <= names
-    assert "uncertainty" in capsys.readouterr().out
 
 
 def test_the_stated_uncertainty_is_that_of_noise():
-    rig = vertical_rig({"scheme": "phase-shift", "pitches_px": [48, 912], "steps": [4, 8]})
-    x, y = (axis.ravel() for axis in rig.camera.rays())
-    u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * 1.8)
+    rig = vertical_rig(TWO_PERIODS)
+    u_px = projected(rig, 1.8)[0].ravel()
     profiles = rig.code("vertical").profiles(912).astype(float)
     random, depths = np.random.default_rng(5), []
     for _ in range(30):
         frames = [
-            np.interp(u_px, np.arange(912), row) * 0.7 + 20 + random.normal(0, 2, len(x))
+            np.interp(u_px, np.arange(912), row) * 0.7 + 20 + random.normal(0, 2, u_px.size)
             for row in profiles
         ]
-        frames = [*frames, np.full(len(x), 200.0), np.full(len(x), 20.0)]
+        frames += [np.full(u_px.size, 200.0), np.full(u_px.size, 20.0)]
         images = np.clip(frames, 0, 255).astype(np.float32).reshape(14, SIZE, SIZE)
         decoded = decode_stack(images, rig, details=True)
         depths.append(np.where(decoded.depth_mm > 0, decoded.depth_mm, np.nan))
@@ -131,127 +137,96 @@ def test_slope_is_the_difference_of_projections():
         np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 0.2, rtol=1e-6)
 
 
-def written(folder, frames, tmp_path):
-    scan = tmp_path / "scan"
-    scan.mkdir()
-    for index, frame in enumerate(frames):
-        cv2.imwrite(str(scan / f"frame_{index}.png"), frame)
-    return scan
-
-
-def test_saturated_frames_are_named(capture, tmp_path, capsys):
-    folder, row = capture
-    bright = [
-        np.clip(frame.astype(float) * 2.5, 0, 255).astype(np.uint8) for frame in row.frames.values()
-    ]
-    assert decode(folder, written(folder, bright, tmp_path), tmp_path / "out") == 0
+def test_saturated_frames_are_named(capture, decode, tmp_path, capsys):
+    bright = np.clip(np.multiply(capture[1], 2.5), 0, 255).astype(np.uint8)
+    assert decode(write(tmp_path / "bright", bright)) == 0
     assert "saturated on lit pixels: frame_" in capsys.readouterr().err
     assert (np.load(tmp_path / "out" / "reason.npy") == Reason.SATURATED).any()
 
 
-def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
-    folder, row = capture
-    frames = list(row.frames.values())
+def test_findings_are_told_and_anyway_decodes(capture, scan, decode, tmp_path, capsys):
+    frames, out = list(capture[1]), tmp_path / "out"
     frames[3] = frames[2]
-    scan = written(folder, frames, tmp_path)
-    assert decode(folder, folder / "scan", tmp_path / "out") == 0
+    equal = write(tmp_path / "equal", frames)
+    assert decode(scan) == 0
     said = capsys.readouterr()
     assert "not checked" in said.out and "warning" not in said.err
-    by_source = json.loads((tmp_path / "out" / "decode.json").read_text())
-    for source, sigma_mm in by_source["median_sigma_mm_by_source"].items():
+    by_source = read_json(out / "decode.json")["median_sigma_mm_by_source"]
+    for source, sigma_mm in by_source.items():
         assert f"by {source}:" in said.out and f" {sigma_mm:.3f} mm" in said.out
     assert "an order that is wrong by one would add" in said.out
-    assert decode(folder, scan, tmp_path / "out") == 2
-    assert "frame_2.png and frame_3.png show the same image" in capsys.readouterr().err
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [
-        "decode.json"
-    ]  # of the refused capture
-    refused = json.loads((tmp_path / "out" / "decode.json").read_text())
+    assert "frame_2.png and frame_3.png show the same image" in refusal(decode, equal)
+    assert [path.name for path in out.iterdir()] == ["decode.json"]  # of the refused capture
+    refused = read_json(out / "decode.json")
     assert refused["examination"]["findings"][0]["severity"] == "refuse" and "pixels" not in refused
-    assert decode(folder, scan, tmp_path / "out", "--anyway", "--forms", "npy") == 0
+    assert decode(equal, "--anyway --forms npy") == 0
     assert "warning: equal frames" in capsys.readouterr().err
-    report = json.loads((tmp_path / "out" / "decode.json").read_text())
+    report = read_json(out / "decode.json")
     assert report["examination"]["findings"][0]["name"] == "equal frames"
-    assert report["pixels"] and not (tmp_path / "out" / "depth.mat").exists()
+    assert report["pixels"] and not (out / "depth.mat").exists()
 
 
-def test_jpeg_is_a_finding(capture, tmp_path, capsys):
-    folder, row = capture
-    (tmp_path / "scan").mkdir()
-    for index, frame in row.frames.items():
-        cv2.imwrite(
-            str(tmp_path / "scan" / f"frame_{index}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 80]
-        )
-    assert decode(folder, tmp_path / "scan", tmp_path / "out") == 2
-    said = capsys.readouterr().err
+def test_jpeg_is_a_finding(capture, decode, tmp_path):
+    _, frames, exact_mm = capture
+    jpeg = write(tmp_path / "jpeg", frames, "jpg", [cv2.IMWRITE_JPEG_QUALITY, 80])
+    said = refusal(decode, jpeg)
     assert "compressed with loss: frame_0.jpg and 13 more are" in said and "--anyway" in said
     across, between = map(float, re.findall(r"change by ([\d.]+) across.* by ([\d.]+)", said)[0])
     assert across > 1.05 * between
-    assert decode(folder, tmp_path / "scan", tmp_path / "out", "--anyway", "--forms", "npy") == 0
+    assert decode(jpeg, "--anyway --forms npy") == 0
     depth_mm = np.load(tmp_path / "out" / "depth.npy")
-    both = (depth_mm > 0) & (row.depth_exact_mm > 0)
-    assert np.median(np.abs(depth_mm - row.depth_exact_mm)[both]) < 4
+    both = (depth_mm > 0) & (exact_mm > 0)
+    assert np.median(np.abs(depth_mm - exact_mm)[both]) < 4
 
 
 def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(
-    capture, tmp_path, monkeypatch
+    scan, decode, tmp_path, monkeypatch
 ):
-    folder, _ = capture
-
-    def killed(*_, **__):
-        raise KeyboardInterrupt
-
-    assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "png") == 0
+    out = tmp_path / "out"
+    assert decode(scan, "--forms png") == 0
+    killed = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr("fpp_ml_bench.loaders.captures.exports.write_report", killed)
-    assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "npy") == 130
-    assert not (tmp_path / "out" / "decode.json").exists()  # what is there is no result
-    (tmp_path / "out" / ".0123456789abcdef.tmp").write_bytes(b"cut off")
+    assert decode(scan, "--forms npy") == 130
+    assert not (out / "decode.json").exists()  # what is there is no result
+    (out / ".0123456789abcdef.tmp").write_bytes(b"cut off")
     monkeypatch.undo()
-    assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "mat") == 0
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"decode.json", "depth.mat"} <= names and not {
-        "depth.npy",
-        ".0123456789abcdef.tmp",
-    } & names
+    assert decode(scan, "--forms mat") == 0
+    names = {path.name for path in out.iterdir()}
+    assert {"decode.json", "depth.mat"} <= names
+    assert names.isdisjoint({"depth.npy", ".0123456789abcdef.tmp"})
 
 
 @pytest.mark.parametrize(("steps", "gamma"), [(3, 2.2), (4, 1.5), (6, 1.0)])
 def test_the_stated_uncertainty_holds_the_error_of_gamma(steps, gamma):
     rig = vertical_rig({"scheme": "phase-shift", "pitch_px": 57, "steps": steps, "gray": {}})
-    x, y = rig.camera.rays()
-    depth_m = 1.8 / (1.0 - 0.4 * x + 0.25 * y)
-    u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None])
+    depth_m = tilted(rig)
+    u_px, _ = projected(rig, depth_m)
     profiles = [*rig.code("vertical").profiles(912), np.full(912, 255), np.zeros(912)]
     light = np.stack([np.interp(u_px, np.arange(912), row) / 255 for row in profiles]) ** gamma
     frames = 12 + 180 * light + np.random.default_rng(3).normal(0, 1, light.shape)
     files = tuple(Path(f"scan/{index}.png") for index in range(len(frames)))
     result = decode_capture(CapturedFrames(np.rint(frames).astype(np.uint8), files), rig)
-    found = (
-        (result.decoded.depth_mm > 0) & (u_px > 5) & (u_px < 906)
-    )  # the interpolation ends with the pattern
+    inside = (u_px > 5) & (u_px < 906)  # the interpolation ends with the pattern
+    found = (result.decoded.depth_mm > 0) & inside
     error_mm = np.abs(result.decoded.depth_mm - 1000 * depth_m)[found]
-    assert (
-        found.mean() > 0.9 and (error_mm > 100).mean() < 0.001
-    )  # of wrong orders no uncertainty is stated
+    # Of wrong orders no uncertainty is stated.
+    assert found.mean() > 0.9 and (error_mm > 100).mean() < 0.001
     assert 1 / 3 < 0.6745 * np.median(result.sigma_mm[found]) / np.median(error_mm) < 3
 
 
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["--working-range", "1,2"], "1 to 2 mm, where no rig looks"),
-        (["--direction", "horizontal"], "no horizontal"),
-        (["--forms", "obj"], "expected some of npy, mat"),
-        (["--mask", "none.npy"], "none.npy"),
-        (["--bits", "12"], "expected levels of 12 bits"),
-        (["--noise", "-1"], "noise_grey: expected grey levels above 0"),
+        ("--working-range 1,2", "1 to 2 mm, where no rig looks"),
+        ("--direction horizontal", "no horizontal"),
+        ("--forms obj", "expected some of npy, mat"),
+        ("--mask none.npy", "none.npy"),
+        ("--bits 12", "expected levels of 12 bits"),
+        ("--noise -1", "noise_grey: expected grey levels above 0"),
     ],
 )
-def test_bad_words_are_a_sentence_and_nothing_is_written(capture, tmp_path, capsys, words, said):
-    folder, _ = capture
-    assert decode(folder, folder / "scan", tmp_path / "out", *words) == 2
-    error = capsys.readouterr().err
-    assert said in error and "Traceback" not in error and not (tmp_path / "out").exists()
+def test_bad_words_are_a_sentence_and_nothing_is_written(scan, decode, tmp_path, words, said):
+    assert said in refusal(decode, scan, words) and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -262,48 +237,42 @@ def test_bad_words_are_a_sentence_and_nothing_is_written(capture, tmp_path, caps
         (lambda frames: [np.zeros_like(frame) for frame in frames], "too faint"),
     ],
 )
-def test_a_bad_capture_is_a_sentence(capture, tmp_path, capsys, change, said):
-    folder, row = capture
-    scan = written(folder, change(list(row.frames.values())), tmp_path)
-    assert decode(folder, scan, tmp_path / "out") == 2
-    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
+def test_a_bad_capture_is_a_sentence(capture, decode, tmp_path, change, said):
+    bad = write(tmp_path / "bad", change(capture[1]))
+    assert said in refusal(decode, bad) and not (tmp_path / "out").exists()
 
 
-def test_patterns_come_with_a_manifest(tmp_path, capsys):
-    file = tmp_path / "projector.yaml"
+def test_patterns_come_with_a_manifest(tmp_path):
+    file, images = tmp_path / "projector.yaml", tmp_path / "images"
     file.write_text(
         "projector: {width: 200, height: 100}\n"
         "sequence: {order: [white, vertical, black], vertical: {scheme: gray, cell_px: 2}}\n"
     )
-    again = ["patterns", str(file), "--out", str(tmp_path / "images"), "--board", "checker:9x13:10"]
-    assert main(again) == 0
-    assert (tmp_path / "images" / "board.pdf").read_bytes().startswith(b"%PDF")
-    manifest = json.loads((tmp_path / "images" / "patterns.json").read_text())
+    line = f"patterns {file} --out {images} --board checker:9x13:10"
+    assert fpp_bench(line) == 0
+    assert (images / "board.pdf").read_bytes().startswith(b"%PDF")
+    manifest = read_json(images / "patterns.json")
     assert manifest["projector_px"] == [200, 100] and len(manifest["frames"]) == 9
     assert manifest["frames"][1]["shows"] == "vertical Gray bit 0"
-    white = cv2.imread(str(tmp_path / "images" / "A_0.png"), cv2.IMREAD_UNCHANGED)
+    white = read_image(images / "A_0.png")
     assert white.shape == (100, 200) and (white == 255).all()
-    assert main(again) == 0  # the whole set is there
-    (tmp_path / "images" / "A_1.png").write_bytes(b"other")
-    assert main(again) == 2
-    assert "is not empty; give a new folder, so that no old pattern" in capsys.readouterr().err
+    assert fpp_bench(line) == 0  # the whole set is there
+    (images / "A_1.png").write_bytes(b"other")
+    said = refusal(fpp_bench, line)
+    assert "is not empty; give a new folder, so that no old pattern" in said
 
 
-def test_of_two_that_write_patterns_one_is_told(tmp_path, capsys):
+def test_of_two_that_write_patterns_one_is_told(tmp_path):
     with whole_folder(tmp_path / "images", "here", CaptureError):
-        assert main(["patterns", "paper", "--out", str(tmp_path / "images")]) == 2
-    assert "another process is writing patterns there" in capsys.readouterr().err
+        said = refusal(fpp_bench, "patterns paper --out", tmp_path / "images")
+    assert "another process is writing patterns there" in said
 
 
-def test_of_two_that_decode_into_a_folder_one_is_told(capture, tmp_path, capsys):
-    folder, _ = capture
+def test_of_two_that_decode_into_a_folder_one_is_told(scan, decode, tmp_path):
     out = tmp_path / "out"
     with exclusive(out / LOCK_FILE, out, "here", CaptureError):
-        assert decode(folder, folder / "scan", out) == 2
-    assert (
-        f"{out}: another process is decoding into this folder; wait for it"
-        in capsys.readouterr().err
-    )
+        said = refusal(decode, scan)
+    assert f"{out}: another process is decoding into this folder; wait for it" in said
 
 
 @pytest.mark.parametrize(
@@ -319,9 +288,7 @@ def test_of_two_that_decode_into_a_folder_one_is_told(capture, tmp_path, capsys)
         ),
     ],
 )
-def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text, said):
+def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, text, said):
     (tmp_path / "projector.yaml").write_text(text)
-    assert (
-        main(["patterns", str(tmp_path / "projector.yaml"), "--out", str(tmp_path / "images")]) == 2
-    )
-    assert said in capsys.readouterr().err and not (tmp_path / "images").exists()
+    line = f"patterns {tmp_path}/projector.yaml --out {tmp_path}/images"
+    assert said in refusal(fpp_bench, line) and not (tmp_path / "images").exists()

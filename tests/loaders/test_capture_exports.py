@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.io
 import trimesh
+from conftest import read_image
 from PIL import Image
 
 from fpp_ml_bench.errors import CaptureError
@@ -23,6 +24,7 @@ from fpp_ml_bench.optics.pinhole import Pinhole
 
 CAMERA = Pinhole(64, 48, 90.0, 92.0, 30.3, 24.1, (-0.05, 0.01, 0.001, -0.001, 0.0))
 X, Y = CAMERA.rays()
+RAYS = np.stack([X, Y, np.ones_like(X)], axis=-1)
 PLANE = np.array([0.3, -0.4, -np.sqrt(0.75)])  # its unit normal, towards the camera
 PLANE_MM = -600.0 * PLANE[2] / -(PLANE[0] * X + PLANE[1] * Y + PLANE[2])  # 600 mm on the axis
 CENTRE, RADIUS = np.array([10.0, -5.0, 700.0]), 150.0
@@ -30,15 +32,10 @@ CENTRE, RADIUS = np.array([10.0, -5.0, 700.0]), 150.0
 
 def _sphere():
     """Depth float64 of a sphere, 0 beside it, and its normals."""
-    rays = np.stack([X, Y, np.ones_like(X)], axis=-1)
-    square, along = (rays * rays).sum(-1), rays @ CENTRE
+    square, along = (RAYS * RAYS).sum(-1), RAYS @ CENTRE
     root = along**2 - square * (CENTRE @ CENTRE - RADIUS**2)
     depth = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / square, 0.0)
-    return depth, (rays * depth[..., None] - CENTRE) / RADIUS
-
-
-def _degrees(normals, expected):
-    return np.degrees(np.arccos(np.clip((normals * expected).sum(-1), -1, 1)))
+    return depth, (RAYS * depth[..., None] - CENTRE) / RADIUS
 
 
 def test_normals_of_a_plane():
@@ -54,21 +51,18 @@ def test_normals_of_a_sphere():
     there = depth > 0
     assert np.isfinite(normals).all() and (normals[~there] == 0).all()
     np.testing.assert_allclose((normals[there] ** 2).sum(-1), 1, rtol=1e-12)
-    inclined = -(expected * np.stack([X, Y, np.ones_like(X)], -1)).sum(-1) / np.sqrt(
-        X**2 + Y**2 + 1
-    )
+    inclined = -(expected * RAYS).sum(-1) / np.sqrt((RAYS * RAYS).sum(-1))
     inside = cv2.erode(there.astype(np.uint8), np.ones((3, 3))) > 0
-    assert _degrees(normals, expected)[inside & (inclined > 0.6)].max() < 1.0
-    assert there.sum() > 1000
+    off = np.degrees(np.arccos(np.clip((normals * expected).sum(-1), -1, 1)))
+    assert off[inside & (inclined > 0.6)].max() < 1.0 and there.sum() > 1000
 
 
 def test_a_pixel_alone_faces_the_camera_and_steps_are_not_joined():
     depth = np.zeros((48, 64))
     depth[5, 7] = 500.0
-    ray = np.array([X[5, 7], Y[5, 7], 1.0])
-    np.testing.assert_allclose(
-        pixel_normals(depth, CAMERA)[5, 7], -ray / np.sqrt(ray @ ray), rtol=1e-12
-    )
+    ray = RAYS[5, 7]
+    alone = pixel_normals(depth, CAMERA)[5, 7]
+    np.testing.assert_allclose(alone, -ray / np.sqrt(ray @ ray), rtol=1e-12)
     depth[:] = 500.0
     depth[:, 32:] = 600.0
     flat = pixel_normals(depth, CAMERA)
@@ -79,12 +73,10 @@ def test_a_pixel_alone_faces_the_camera_and_steps_are_not_joined():
 def test_triangles_of_a_plane_are_its_normal_and_cover_it():
     faces = triangles(PLANE_MM, CAMERA)
     assert len(faces) == 2 * 47 * 63 and np.unique(faces).size == 48 * 64
-    points = (np.stack([X, Y, np.ones_like(X)], -1) * PLANE_MM[..., None]).reshape(-1, 3)
-    a, b, c = (points[faces[:, i]] for i in range(3))
+    a, b, c = np.moveaxis((RAYS * PLANE_MM[..., None]).reshape(-1, 3)[faces], 1, 0)
     across = np.cross(b - a, c - a)
-    np.testing.assert_allclose(
-        across / np.sqrt((across**2).sum(-1, keepdims=True)), [PLANE] * len(faces), atol=1e-9
-    )
+    across /= np.sqrt((across**2).sum(-1, keepdims=True))
+    np.testing.assert_allclose(across, [PLANE] * len(faces), atol=1e-9)
 
 
 @pytest.mark.parametrize("missing", [(0, 0), (0, 1), (1, 0), (1, 1)])
@@ -115,10 +107,10 @@ def test_arrays_come_back_in_other_readers(written):
     for read in (
         np.load(files["depth.npy"]),
         scipy.io.loadmat(files["depth.mat"])["depthMap"],
-        cv2.imread(str(files["depth.pfm"]), cv2.IMREAD_UNCHANGED),
+        read_image(files["depth.pfm"]),
     ):
         assert read.dtype == np.float32 and np.array_equal(read, depth)
-    levels = cv2.imread(str(files["depth_0.1mm.png"]), cv2.IMREAD_UNCHANGED)
+    levels = read_image(files["depth_0.1mm.png"])
     assert levels.dtype == np.uint16 and np.array_equal(levels > 0, depth > 0)
     np.testing.assert_allclose(levels * 0.1, depth, atol=0.05 + 1e-4)
     assert Image.open(files["depth_0.1mm.png"]).text == {"mm_per_level": "0.1"}
@@ -147,8 +139,7 @@ def test_points_and_mesh_lie_on_the_sphere(written):
 
 
 def test_the_grey_image_is_stored_unrounded(written):
-    _, grey, files = written
-    depth, _, _ = written
+    depth, grey, files = written
     content = files["points.ply"].read_bytes()
     fields = np.dtype([("geometry", "<f4", 6), ("colour", "u1", 4), ("intensity", "<f4")])
     start = content.index(b"end_header\n") + len(b"end_header\n")
@@ -170,7 +161,7 @@ def test_the_png_takes_the_finest_unit_that_fits(tmp_path, largest_mm, name):
     depth[0, 0], depth[0, 1] = largest_mm, 0
     (file,) = export_capture(tmp_path, depth, CAMERA, forms=["png"])
     assert file.name == name
-    levels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    levels = read_image(file)
     unit = float(name.removeprefix("depth_").removesuffix("mm.png"))
     np.testing.assert_allclose(levels * unit, depth, atol=unit / 2 * 1.001)
 

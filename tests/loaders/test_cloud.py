@@ -13,16 +13,15 @@ import numpy as np
 import pytest
 import trimesh
 from chromium import Browser
+from conftest import fpp_bench, printed, refusal
 from PIL import Image
 from rendering import RIG
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.loaders import cloud as cloud_module
 from fpp_ml_bench.loaders.cloud import cloud_html, write_cloud
 
 X, Y = RIG.camera.rays()
-SIDE = RIG.camera.height
 HOSTILE = "</script><script>hacked = 1</script>"
 
 
@@ -117,15 +116,14 @@ def test_refused_points(points_mm, grey, said):
         cloud_html("none", points_mm, grey)
 
 
-def test_command(tiny, tmp_path, capsys):
+def test_command(tiny, tmp_path):
     picture = tmp_path / "pictures" / "mug.png"
-    assert main(["show", str(tiny), "mug_A0", "--out", str(picture), "--cloud"]) == 0
+    said = printed(fpp_bench, f"show {tiny} mug_A0 --out {picture} --cloud")
     names = [picture, picture.with_suffix(".ply"), picture.with_suffix(".html")]
-    assert capsys.readouterr().out.splitlines()[-3:] == [str(name) for name in names]
+    assert said.splitlines()[-3:] == [str(name) for name in names]
     assert all(name.is_file() for name in names) and "mug_A0: exact depth" in names[2].read_text()
     assert len(trimesh.load(names[1]).vertices) == len(held(names[2].read_bytes())["places"]) > 50
-    assert main(["show", str(tiny), "--sheet", "--cloud"]) == 2
-    assert "expected a SAMPLE" in capsys.readouterr().err
+    assert "expected a SAMPLE" in refusal(fpp_bench, "show", tiny, "--sheet --cloud")
 
 
 @pytest.fixture(scope="module")
@@ -198,13 +196,9 @@ def _halves(pixels: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def test_the_near_side_follows_the_pointer(browser, tmp_path):
     """A near point, bright, before a dark plane moves to the right with a drag to the right, and
     down with one down."""
-    x, y = (
-        axis.ravel() for axis in np.meshgrid(np.linspace(-100, 100, 60), np.linspace(-100, 100, 60))
-    )
-    plane, knob = (
-        np.column_stack([x, y, x * 0 + 1800]),
-        np.column_stack([x / 12, y / 12, x * 0 + 1650]),
-    )
+    x, y = np.meshgrid(*2 * [np.linspace(-100, 100, 60)])
+    plane = np.stack([x, y, x * 0 + 1800], axis=-1).reshape(-1, 3)
+    knob = np.stack([x / 12, y / 12, x * 0 + 1650], axis=-1).reshape(-1, 3)
     grey = np.repeat(np.array([0, 255], np.uint8), len(plane))
     (page := tmp_path / "knob.html").write_bytes(
         cloud_html("knob", np.concatenate([plane, knob]), grey)
@@ -219,24 +213,18 @@ def test_the_near_side_follows_the_pointer(browser, tmp_path):
     start = place()
     box = browser.run("document.getElementById('view').getBoundingClientRect().toJSON()")
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    browser.call(
-        "Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, button="left", clickCount=1
-    )
-    browser.call(
-        "Input.dispatchMouseEvent", type="mouseMoved", x=x + 40, y=y + 30, button="left", buttons=1
-    )
-    browser.call(
-        "Input.dispatchMouseEvent",
-        type="mouseReleased",
-        x=x + 40,
-        y=y + 30,
-        button="left",
-        clickCount=1,
-    )
+
+    def mouse(kind, across=0, down=0, **more):
+        place = {"x": x + across, "y": y + down}
+        browser.call("Input.dispatchMouseEvent", type=kind, **place, **more)
+
+    mouse("mousePressed", button="left", clickCount=1)
+    mouse("mouseMoved", 40, 30, button="left", buttons=1)
+    mouse("mouseReleased", 40, 30, button="left", clickCount=1)
     row, column = place() - start
     assert column > 5 and row > 5
     before = _drawn(_pixels(browser)).sum()
-    browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-300)
+    mouse("mouseWheel", deltaX=0, deltaY=-300)
     assert _wait(lambda: _drawn(_pixels(browser)).sum() > 1.2 * before)
 
 

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from io import BytesIO
+from unittest.mock import Mock
 
 import cv2
 import mlcroissant
@@ -14,14 +15,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from conftest import TINY_CONFIGS
+from conftest import TINY_CONFIGS, flip, fpp_bench, printed, refusal
 from datasets import Array2D, Features, Image
 from hub_server import Repo
 from huggingface_hub import constants
 from publishing import DATA, ODD_OBJECT, ROOT, SIZE, listed, make_all_frames, running_hub
 from scored_dataset import make_dataset
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.sample import config_columns
 
 pytestmark = pytest.mark.long
@@ -47,9 +47,9 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="module")
 def published(client, dataset):
     """What the runs said that published the dataset as ``alice/fpp``: dry, real, again."""
-    call = ["dataset", str(dataset.path), "--repo", "alice/fpp"]
+    call = f"dataset {dataset.path} --repo alice/fpp"
     client.server.writes()
-    dry = client.good([*call, "--dry-run"])
+    dry = client.good(f"{call} --dry-run")
     dry_writes, dry_repos = client.server.writes(), dict(client.server.repos)
     real = client.good(call)
     real_writes = client.server.writes()
@@ -200,53 +200,39 @@ def test_the_card_names_columns_and_files_of_each_configuration(published, clien
 @pytest.mark.parametrize(
     ("what", "offline"), [("dataset", True), ("dataset", False), ("leaderboard", False)]
 )
-def test_a_dry_run_works_without_a_network(small, monkeypatch, capsys, tmp_path, what, offline):
-    def refuse(*args):
-        raise OSError("no network in this test")
-
+def test_a_dry_run_works_without_a_network(small, monkeypatch, what, offline):
+    refuse = Mock(side_effect=OSError("no network in this test"))
     monkeypatch.setattr(socket.socket, "connect", refuse)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
-    call = [
-        "publish",
-        what,
-        *([str(small.path)] if what == "dataset" else []),
-        "--repo",
-        "alice/never",
-    ]
-    assert main([*call, "--dry-run"]) == 0
-    output = capsys.readouterr().out
+    call = f"publish {what} {small.path if what == 'dataset' else ''} --repo alice/never"
+    output = printed(fpp_bench, call, "--dry-run")
     expected = (
         {*DATA, "README.md", "overview.png"} if what == "dataset" else {"README.md", "index.html"}
     )
     assert expected <= listed(output).keys() and set(listed(output).values()) == {"new"}
     reason = "HF_HUB_OFFLINE is set" if offline else "can't be reached"
-    assert (
-        re.search(rf"Nothing was asked of the Hub: .*{reason}", output)
-        and "Dry run: nothing was sent." in output
-    )
+    assert re.search(rf"Nothing was asked of the Hub: .*{reason}", output)
+    assert "Dry run: nothing was sent." in output
     monkeypatch.setenv("HF_TOKEN", "hf_good")
-    assert main(call) == 2
-    assert reason in capsys.readouterr().err
+    assert reason in refusal(fpp_bench, call)
 
 
 def test_the_benchmark_is_registered(published, client):
     evaluation = yaml.safe_load(client.server.repos["datasets", "alice/fpp"].files["eval.yaml"])
     assert evaluation["evaluation_framework"] == "fpp-ml-bench"
-    assert {"id": "single_shot_depth", "config": "single_shot", "split": "test"} in evaluation[
-        "tasks"
-    ]
-    assert {"id": "multi_frame_depth", "config": "all", "split": "test"} in evaluation["tasks"]
+    for name, config in (("single_shot_depth", "single_shot"), ("multi_frame_depth", "all")):
+        assert {"id": name, "config": config, "split": "test"} in evaluation["tasks"]
 
 
 def test_other_data_replaces_what_changed_and_leaves_what_others_added(client, tmp_path):
     first = make_dataset(tmp_path / "first", size=SIZE)
     second = make_all_frames(tmp_path / "second", seed=1)
-    call = ["--repo", "alice/replaced"]
-    client.good(["dataset", str(first.path), *call])
+    client.good(f"dataset {first.path} --repo alice/replaced")
     repo = client.server.repos["datasets", "alice/replaced"]
     repo.files |= {"NOTES.txt": b"by hand", "data/stray.parquet": b"old"}
     staged = tmp_path / "staged"
-    output = client.good(["dataset", str(second.path), *call, "--staging", str(staged)])
+    call = f"dataset {second.path} --repo alice/replaced --staging {staged}"
+    output = client.good(call)
     assert listed(output)["data/stray.parquet"] == "deleted"
     assert "NOTES.txt" not in listed(output)
     assert listed(output)[DATA[2]] == "changed"
@@ -256,15 +242,13 @@ def test_other_data_replaces_what_changed_and_leaves_what_others_added(client, t
     assert len(modified) == 3
     (staged / "files" / "data" / ".test.parquet.1.tmp").write_bytes(b"of a run that was killed")
     client.server.writes()
-    assert "Nothing to send" in client.good(
-        ["dataset", str(second.path), *call, "--staging", str(staged)]
-    )
+    assert "Nothing to send" in client.good(call)
     assert {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")} == modified
     assert client.server.writes() == []
 
 
 def test_a_run_that_was_cut_off_sends_only_what_is_missing(client, small):
-    call = ["dataset", str(small.path), "--repo", "cut/fpp"]
+    call = f"dataset {small.path} --repo cut/fpp"
     client.server.large.clear()
     client.server.writes()
     (first, second) = client.run(call, call)
@@ -279,36 +263,32 @@ def test_a_run_that_was_cut_off_sends_only_what_is_missing(client, small):
 def test_refusals(client, small, tmp_path):
     """Everything that can go wrong before or on the way says what and what to do, with status 2 and
     no traceback."""
-    good = ["dataset", str(small.path), "--repo"]
-    client.good([*good, "alice/public"])
+    good = f"dataset {small.path} --repo"
+    client.good(f"{good} alice/public")
     client.server.repos["datasets", "alice/other"] = Repo(files={"train.csv": b"a,b\n"})
     client.server.repos["datasets", "raced/fpp"] = Repo()
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "thesis.tex").write_text("mine")
     cases = [
-        ([*good, "nobody"], "OWNER/NAME"),
-        ([*good, "alice/\x1b[31mred"], r"\\x1b"),
-        ([*good, "bob/fpp"], "make repositories of alice"),
+        (f"{good} nobody", "OWNER/NAME"),
+        (f"{good} alice/\x1b[31mred", r"\\x1b"),
+        (f"{good} bob/fpp", "make repositories of alice"),
         (
-            [*good, "forbidden/fpp"],
+            f"{good} forbidden/fpp",
             r"403\); it needs write access.*The Hub says: You don't have the rights",
         ),
-        ([*good, "broken/fpp"], r"fault \(500\)"),
-        ([*good, "alice/other"], r"did not publish \(train.csv.*--adopt"),
-        ([*good, "raced/fpp"], r"committed meanwhile \(412\)"),
-        ([*good, "alice/public", "--private"], "exists and is public"),
-        ([*good, "alice/new", "--staging", str(tmp_path / "occupied")], "holds files"),
-        ([*good, "alice/new", "--license", "all rights: reserved"], "--license"),
-        (["dataset", str(tmp_path), "--repo", "alice/new"], "no dataset"),
-        (
-            ["results", "r.json", "--repo", "alice/none", "--dataset-repo", "alice/public"],
-            "no such model",
-        ),
+        (f"{good} broken/fpp", r"fault \(500\)"),
+        (f"{good} alice/other", r"did not publish \(train.csv.*--adopt"),
+        (f"{good} raced/fpp", r"committed meanwhile \(412\)"),
+        (f"{good} alice/public --private", "exists and is public"),
+        (f"{good} alice/new --staging {tmp_path}/occupied", "holds files"),
+        ([*good.split(), "alice/new", "--license", "all rights: reserved"], "--license"),
+        (f"dataset {tmp_path} --repo alice/new", "no dataset"),
+        ("results r.json --repo alice/none --dataset-repo alice/public", "no such model"),
     ]
     client.server.writes()
-    for (call, message), (status, _, error) in zip(
-        cases, client.run(*(call for call, _ in cases)), strict=True
-    ):
+    answers = client.run(*(call for call, _ in cases))
+    for (call, message), (status, _, error) in zip(cases, answers, strict=True):
         assert status == 2, call
         assert re.search(message, error, re.DOTALL), (call, error)
         assert "Traceback" not in error and "\x1b" not in error
@@ -330,9 +310,8 @@ def test_refusals(client, small, tmp_path):
 )
 def test_no_way_to_the_hub(client, small, environment, message):
     client.server.writes()
-    ((status, _, error),) = client.run(
-        ["dataset", str(small.path), "--repo", "alice/never"], **environment
-    )
+    call = f"dataset {small.path} --repo alice/never"
+    ((status, _, error),) = client.run(call, **environment)
     assert status == 2
     assert re.search(message, error, re.DOTALL), error
     assert "Traceback" not in error
@@ -342,11 +321,11 @@ def test_no_way_to_the_hub(client, small, environment, message):
 def test_adopting_and_private(client, small):
     repo = client.server.repos["datasets", "alice/adopted"] = Repo()
     repo.files["train.csv"] = b"a,b\n"
-    call = ["dataset", str(small.path), "--repo"]
+    call = f"dataset {small.path} --repo"
     (adopted, private, unseen) = client.run(
-        [*call, "alice/adopted", "--adopt"],
-        [*call, "alice/secret", "--private"],
-        [*call, "alice/secret", "--dry-run"],
+        f"{call} alice/adopted --adopt",
+        f"{call} alice/secret --private",
+        f"{call} alice/secret --dry-run",
     )
     assert adopted[0] == private[0] == unseen[0] == 0
     assert repo.files["train.csv"] == b"a,b\n" and DATA[0] in repo.files
@@ -357,10 +336,8 @@ def test_adopting_and_private(client, small):
 def test_a_damaged_dataset_is_not_published(client, tmp_path):
     dataset = make_dataset(tmp_path / "d", size=SIZE)
     path = dataset.path / dataset.manifest.shards[0].path
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    ((status, _, error),) = client.run(["dataset", str(dataset.path), "--repo", "alice/damaged"])
+    flip(path)
+    ((status, _, error),) = client.run(f"dataset {dataset.path} --repo alice/damaged")
     assert status == 2 and path.name in error and "checksum" in error
     assert ("datasets", "alice/damaged") not in client.server.repos
 

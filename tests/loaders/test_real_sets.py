@@ -1,15 +1,14 @@
 """Sets of real captures: those that the package describes, and one that a user describes."""
 
-import json
 from hashlib import sha256
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from test_capture_import import RIG, UNIT_CUE, coded_rig, frames_of, run, write
+from conftest import fpp_bench, fpp_eval, printed, read_json, refusal
+from test_capture_import import RIG, UNIT_CUE, coded_rig, frames_of, write
 
-from fpp_ml_bench.cli import main_eval as evaluate
 from fpp_ml_bench.loaders.captures.real import read_set, set_names
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -48,79 +47,68 @@ def copied(tmp_path):
 
 
 def importing(folder, *more):
-    words = "import", folder / "repo", "--real", folder / "plane.yaml", "--out", folder / "set"
-    return run(*words, "--workers", 1, *more)
+    line = f"import {folder}/repo --real {folder}/plane.yaml --out {folder}/set --workers 1"
+    return fpp_bench(line, *more)
 
 
-def test_a_real_set_is_a_dataset_whose_undecoded_pixels_count_nowhere(copied, capsys):
-    assert importing(copied) == 0
-    said = capsys.readouterr().out
+def test_a_real_set_is_a_dataset_whose_undecoded_pixels_count_nowhere(copied):
+    said = printed(importing, copied)
     assert "A plane, from https://example.com/plane at commit 0123456; licence: CC0" in said
     assert "known: a third of it is dark {so}" in said and "differ" not in said
     opened = DatasetFolder(copied / "set")
     (sample,) = opened.splits["test"]
     void, depth_mm = opened.void(sample), opened.depth_mm(sample)
     assert (void == (depth_mm == 0)).all() and 0.2 < void.mean() < 0.5
-    out = copied / "constant"
-    assert run("predict", "constant", copied / "set", "--at", "standoff", "--out", out) == 0
-    result = copied / "result.json"
-    assert run(out, copied / "set", "--json", result, command=evaluate) == 0
+    out, result = copied / "constant", copied / "result.json"
+    assert fpp_bench(f"predict constant {copied}/set --at standoff --out {out}") == 0
+    assert "without background" in printed(fpp_eval, f"{out} {copied}/set --json {result}")
     error_mm = np.abs(1000 * RIG.standoff_m - depth_mm[~void]).mean()
-    metrics = json.loads(result.read_text())["metrics"]
+    metrics = read_json(result)["metrics"]
     assert metrics["two_sided_mae_mm"] == pytest.approx(error_mm, rel=1e-4)
     assert metrics["background_mae_mm"] is None and metrics["invented_share"] == 0
-    assert "without background" in capsys.readouterr().out
-    assert run("leaderboard", result) == 0
-    assert "Real light, plane, " in capsys.readouterr().out
+    assert "Real light, plane, " in printed(fpp_bench, "leaderboard", result)
 
 
-def test_files_of_another_commit_are_named(copied, capsys):
+def test_files_of_another_commit_are_named(copied):
     file = copied / "repo" / "plane" / "frame_2.png"
     assert cv2.imwrite(str(file), cv2.imread(str(file), 0), [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    assert importing(copied) == 0
-    assert "files that differ from those of that commit: plane/frame_2.png" in (
-        capsys.readouterr().out
-    )
+    said = printed(importing, copied)
+    assert "files that differ from those of that commit: plane/frame_2.png" in said
 
 
-def test_what_is_not_there_is_named(copied, capsys):
+def test_what_is_not_there_is_named(copied):
     (copied / "repo" / "plane" / "frame_3.png").unlink()
-    assert importing(copied) == 2
-    said = capsys.readouterr().err
+    said = refusal(importing, copied)
     assert "found no plane/frame_3.png; get it by git clone https://example.com/plane" in said
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--real", "nobodys"], "--real nobodys: expected one of maximm8-left"),
-        (["--rig", "rig.yaml"], "--real: --rig can't be changed"),
-        (["--captures"], "--real: --captures can't be changed"),
-        (["--bits", "12"], "--real: --bits can't be changed"),
-        (["--frame-order", "paper"], "--real: --frame-order can't be changed"),
+        ("--real nobodys", "--real nobodys: expected one of maximm8-left"),
+        ("--rig rig.yaml", "--real: --rig can't be changed"),
+        ("--captures", "--real: --captures can't be changed"),
+        ("--bits 12", "--real: --bits can't be changed"),
+        ("--frame-order paper", "--real: --frame-order can't be changed"),
     ],
 )
-def test_options_that_a_set_does_not_take(copied, words, said, capsys):
-    assert importing(copied, *words) == 2
-    assert said in capsys.readouterr().err
+def test_options_that_a_set_does_not_take(copied, words, said):
+    assert said in refusal(importing, copied, words)
 
 
-def test_a_file_that_describes_no_set(copied, capsys):
+def test_a_file_that_describes_no_set(copied):
     described = yaml.safe_load((copied / "plane.yaml").read_text())
     files = described["captures"]["plane"]["front"]
     outside = {f"../{name}": digest for name, digest in files.items()}
+    one_frame = coded_rig(order=["vertical"], vertical=UNIT_CUE).to_dict()
     wrong = [
         ({"captures": {}}, "captures: expected an object"),
         ({"captures": {"a/b": {"front": files}}}, "expected an object of letters"),
         ({"captures": {"plane": {"front": outside}}}, "expected a path inside the repository"),
         ({"licence": None}, "licence"),
         ({"rig": {**described["rig"], "camera": {}}}, "rig: camera"),
-        (
-            {"rig": coded_rig(order=["vertical"], vertical=UNIT_CUE).to_dict()},
-            "captures.plane.front: expected the",
-        ),
+        ({"rig": one_frame}, "captures.plane.front: expected the"),
     ]
     for change, said in wrong:
         (copied / "plane.yaml").write_text(yaml.safe_dump(described | change, sort_keys=False))
-        assert importing(copied) == 2
-        assert said in capsys.readouterr().err
+        assert said in refusal(importing, copied)

@@ -14,7 +14,7 @@ from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.render.builder import plan_build
 from fpp_ml_bench.loaders.render.scene import BuildSettings
-from fpp_ml_bench.loaders.training import FringeDepthDataset, unit_range
+from fpp_ml_bench.loaders.training import FringeDepthDataset
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
@@ -96,14 +96,6 @@ def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed,
         assert item.fringe.min() >= 0 and item.fringe.max() <= 1
         if background_removed:
             assert (item.fringe[0].numpy()[depth == 0] == 0).all()
-
-
-def test_grey_levels_become_the_unit_range():
-    grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    out = np.full((16, 16), np.nan, np.float32)
-    unit_range(grey, out)
-    np.testing.assert_allclose(out, grey.astype(np.float64) / 255, rtol=2**-23)
-    assert out[0, 0] == 0 and out[15, 15] == 1
 
 
 def test_flat_sample_is_zero_throughout(tiny, monkeypatch):

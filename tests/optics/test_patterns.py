@@ -1,8 +1,8 @@
 """The projected patterns against the formula, and their PNG files."""
 
-import cv2
 import numpy as np
 import pytest
+from conftest import read_image
 
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.optics.named_rigs import paper_rig
@@ -63,7 +63,7 @@ def test_export_is_lossless_and_in_order(tmp_path):
     paths = export_patterns(SMALL, tmp_path / "patterns")
     assert [path.name for path in paths] == [f"A_{i:02}.png" for i in range(18)]
     for index, path in enumerate(paths):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = read_image(path)
         assert image.ndim == 2 and np.array_equal(image, pattern_image(SMALL, index))
 
 

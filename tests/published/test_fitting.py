@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.io
-from published_trees import command, make_tree
+from conftest import fpp_bench, printed, refusal
+from published_trees import make_tree
 
 from fpp_ml_bench.calibration.from_depth import fit_projector
 from fpp_ml_bench.errors import LayoutError
@@ -41,17 +42,14 @@ def tree(tmp_path_factory):
     return folder / "tree"
 
 
-def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(
-    tree, tmp_path, capsys
-):
-    assert command("calibrate", "--from-depth", tree, "--out", tmp_path / "rig.yaml") == 0
+def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(tree, tmp_path):
+    said = printed(fpp_bench, f"calibrate --from-depth {tree} --out {tmp_path}/rig.yaml")
+    assert "power_drill_A240" in said and "whole px" in said and "wrote" in said
     rig = load_rig(tmp_path / "rig.yaml")
     assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (30, 26)
     np.testing.assert_allclose(rig.t, HIDDEN.t, atol=0.002)
     np.testing.assert_allclose(rig.R, HIDDEN.R, atol=0.001)
     assert rig.projector.fx == pytest.approx(1650, rel=0.003)
-    printed = capsys.readouterr().out
-    assert "power_drill_A240" in printed and "whole px" in printed and "wrote" in printed
 
     reader = plan_import(tree).rows
     read: list[int] = []
@@ -64,38 +62,34 @@ def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(
 
 
 def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, capsys):
-    assert command("import", tree, "--out", tmp_path / "assumed", "--workers", 1) == 0
+    line = f"import {tree} --workers 1 --out {tmp_path}"
+    assert fpp_bench(f"{line}/assumed") == 0
     message = capsys.readouterr().err
-    assert (
-        "warning: the paper's rig did not take" in message and "calibrate --from-depth" in message
-    )
-    assert command("import", tree, "--out", tmp_path / "fitted", "--workers", 1, "--fit-rig") == 0
+    assert "warning: the paper's rig did not take" in message
+    assert "calibrate --from-depth" in message
+    assert fpp_bench(f"{line}/fitted --fit-rig") == 0
     assert "warning" not in capsys.readouterr().err
     rig = DatasetFolder(tmp_path / "fitted").rig
     assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (30, 26)
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("words", "message"),
     [
-        (("--from-depth", "nowhere"), "no such folder"),
-        (("--from-depth", "flat"), "no raw scans"),
-        (("--from-depth", "tree", "--out", "nowhere/rig.yaml"), "does not exist"),
-        (("--from-depth", "tree", "--out", "rig.txt"), "ending in"),
-        (("--from-depth", "tree", "--camera", "wide.yaml"), "its camera has"),
+        ("nowhere", "no such folder"),
+        ("flat", "no raw scans"),
+        ("tree --out nowhere/rig.yaml", "does not exist"),
+        ("tree --out rig.txt", "ending in"),
+        ("tree --camera wide.yaml", "its camera has"),
     ],
-    ids=["no tree", "no raw scans", "no folder", "suffix", "camera"],
 )
-def test_bad_input_is_a_message_status_2_and_no_file(
-    tree, tmp_path, monkeypatch, capsys, options, message
-):
+def test_bad_input_is_a_message_status_2_and_no_file(tree, tmp_path, monkeypatch, words, message):
     make_tree(tmp_path / "flat")
     (tmp_path / "tree").symlink_to(tree)
     save_rig(paper_rig(240), tmp_path / "wide.yaml")
     monkeypatch.chdir(tmp_path)
-    assert command("calibrate", "--out", "rig.yaml", *options) == 2
-    error = capsys.readouterr().err
-    assert "error:" in error and message in error and "Traceback" not in error
+    error = refusal(fpp_bench, "calibrate --out rig.yaml --from-depth", words)
+    assert "error:" in error and message in error
     assert not (tmp_path / "rig.yaml").exists() and not (tmp_path / "rig.txt").exists()
 
 
@@ -140,21 +134,8 @@ def rays(maps):
 def test_import_names_another_reading_of_the_depth(words, change, tree, tmp_path, capsys):
     save_rig(HIDDEN, tmp_path / "rig.yaml")
     changed = rewritten(tree, tmp_path / "tree", change)
-    assert (
-        command(
-            "import",
-            changed,
-            "--out",
-            tmp_path / "data",
-            "--workers",
-            1,
-            "--rig",
-            tmp_path / "rig.yaml",
-        )
-        == 0
-    )
+    line = f"import {changed} --workers 1 --out {tmp_path}/data --rig {tmp_path}/rig.yaml"
+    assert fpp_bench(line) == 0
     error = capsys.readouterr().err
-    assert (f"warning: another reading fits the tree's depth far better: {words}" in error) == bool(
-        words
-    ), error
-    assert words or "warning" not in error
+    said = f"warning: another reading fits the tree's depth far better: {words}"
+    assert (said if words else "") in error and ("warning" in error) == bool(words), error

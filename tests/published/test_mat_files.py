@@ -40,11 +40,8 @@ def test_v73_comes_out_as_matlab_shows_it_not_transposed(tmp_path, dtype):
     file = tmp_path / "a.mat"
     file.write_bytes(v73_bytes(depthMap=DEPTH.astype(dtype)))
     read = read_matrix(file, "depthMap")
-    assert (
-        read.shape == (11, 7)
-        and np.array_equal(read, DEPTH.astype(dtype))
-        and read.flags.c_contiguous
-    )
+    assert read.shape == (11, 7) and np.array_equal(read, DEPTH.astype(dtype))
+    assert read.flags.c_contiguous
 
 
 @pytest.mark.skipif(
@@ -78,12 +75,12 @@ def test_a_v73_file_written_by_matlab():
 
 
 def test_scipy_reads_what_is_written_and_equal_values_give_equal_bytes(tmp_path):
-    content = matrix_bytes({"depthMap": DEPTH.astype(np.float32), "depth_min": 1802.0})
-    assert content == matrix_bytes({"depthMap": DEPTH.astype(np.float32), "depth_min": 1802.0})
+    values = {"depthMap": DEPTH.astype(np.float32), "depth_min": 1802.0}
+    content = matrix_bytes(values)
+    assert content == matrix_bytes(values)
     read = scipy.io.loadmat(io.BytesIO(content))
-    assert read["depthMap"].dtype == np.float32 and np.array_equal(
-        read["depthMap"], DEPTH.astype(np.float32)
-    )
+    assert read["depthMap"].dtype == np.float32
+    assert np.array_equal(read["depthMap"], values["depthMap"])
     assert read["depth_min"].shape == (1, 1)
     (tmp_path / "a.mat").write_bytes(content)
     assert read_scalar(tmp_path / "a.mat", "depth_min") == 1802.0

@@ -52,11 +52,6 @@ def test_every_named_order_is_found_on_the_images(scan):
         assert find_order(files, rig) == order
 
 
-def test_every_view_of_the_dataset_has_the_papers_order(opened):
-    for sample in opened.samples("all"):
-        assert check_order(opened.frames(sample, range(52)), PAPER, opened.rig) == []
-
-
 def test_any_two_exchanged_files_are_noticed_and_at_least_one_is_named(scan):
     frames, rig = scan
     for i, j in list(combinations(range(52), 2))[::5]:

@@ -2,15 +2,16 @@
 
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+from conftest import flip, fpp_bench, printed, refusal
 from published_trees import (
     FOLDERS,
     TRAINING,
     VIEWS,
-    command,
     depth_of,
     depth_path,
     fringe_of,
@@ -32,7 +33,7 @@ from fpp_ml_bench.optics.rig_file import save_rig
 ALL_VARIANTS = ("raw", "global", "individual")
 
 
-def refusal(tree, out):
+def problems(tree, out):
     with pytest.raises(LayoutError) as caught:
         imported(tree, out)
     assert not (out / "manifest.json").exists()
@@ -55,17 +56,10 @@ def test_raw_depth_comes_in_bit_by_bit_with_the_published_split(tmp_path):
     assert_holds_the_tree(dataset)
     for sample in dataset.samples("all"):
         assert dataset.depth_mm(sample).tobytes() == depth_of(sample).tobytes()
-    assert (
-        dataset.configs == ("single_shot",)
-        and not dataset.has_exact
-        and dataset.manifest.origin == "imported"
-    )
+    assert dataset.configs == ("single_shot",) and not dataset.has_exact
     settings = dataset.manifest.settings
-    assert (
-        settings["depth_from"] == FOLDERS["raw"]
-        and settings["rig_assumed"]
-        and settings["frame_order"] is None
-    )
+    assert dataset.manifest.origin == "imported" and settings["rig_assumed"]
+    assert settings["depth_from"] == FOLDERS["raw"] and settings["frame_order"] is None
     assert dataset.rig == paper_rig(24)
 
 
@@ -100,11 +94,10 @@ def test_variants_beside_each_other_are_checked_against_raw(tmp_path):
 
 def test_v73_files_double_depth_and_rgb_copies_read_the_same(tmp_path):
     tree = make_tree(tmp_path / "tree")
-    depth_path(tree).write_bytes(v73_bytes(depthMap=depth_of("power_drill_A60")))
-    write_mat(
-        depth_path(tree, "val", "mug_A0"), False, depthMap=depth_of("mug_A0").astype(np.float64)
-    )
-    write_png(fringe_path(tree), np.repeat(fringe_of("power_drill_A60")[..., None], 3, axis=2))
+    depth_path(tree).write_bytes(v73_bytes(depthMap=DEPTH))
+    double = depth_of("mug_A0").astype(np.float64)
+    write_mat(depth_path(tree, "val", "mug_A0"), False, depthMap=double)
+    write_png(fringe_path(tree), rgb())
     dataset = imported(tree, tmp_path / "out")
     assert_holds_the_tree(dataset)
     for sample in ("power_drill_A60", "mug_A0"):
@@ -129,20 +122,12 @@ def test_dot_files_and_files_beside_the_folders_are_ignored(tmp_path):
 
 def test_an_own_rig_must_fit_the_images(tmp_path):
     tree = make_tree(tmp_path / "tree")
-    assert (
-        imported(tree, tmp_path / "out", rig=paper_rig(24)).manifest.settings["rig_assumed"]
-        is False
-    )
+    settings = imported(tree, tmp_path / "out", rig=paper_rig(24)).manifest.settings
+    assert settings["rig_assumed"] is False
     with pytest.raises(RigError, match=r"48 x 48 px.*24 x 24"):
         plan_import(tree, rig=paper_rig(48))
     with pytest.raises(RigError, match="--rig"):
         plan_import(make_tree(tmp_path / "wide", size=(24, 20)))
-
-
-def set_pixel(path, value):
-    depth = depth_of(path.stem)
-    depth[8, 12] = value
-    write_mat(path, depthMap=depth)
 
 
 def move(source, target):
@@ -150,37 +135,15 @@ def move(source, target):
     shutil.move(source, target)
 
 
-def move_object(tree):
-    """mug's A0 view into train, fringe and depth: mug is in two splits then."""
+def move_sample(tree, stem, target, variant="raw"):
+    """Fringe and depth of a validation sample into another split."""
     for path in (fringe_path, depth_path):
-        move(path(tree, "val", "mug_A0"), path(tree, "train", "mug_A0"))
-
-
-def move_to_test(tree, stem, variant):
-    for path in (fringe_path, depth_path):
-        move(path(tree, "val", stem, variant), path(tree, "test", stem, variant))
+        move(path(tree, "val", stem, variant), path(tree, target, stem, variant))
 
 
 def link_to_nowhere(path):
     path.unlink()
     path.symlink_to("/nowhere.png")
-
-
-def rgb_with_a_colour(tree):
-    image = np.repeat(fringe_of("power_drill_A60")[..., None], 3, axis=2)
-    image[3, 3, 0] ^= 1
-    write_png(fringe_path(tree), image)
-
-
-def remove_view(tree):
-    fringe_path(tree).unlink()
-    depth_path(tree).unlink()
-
-
-def flip(path, position):
-    content = bytearray(path.read_bytes())
-    content[position] ^= 0x10
-    path.write_bytes(content)
 
 
 def cut(path):
@@ -190,152 +153,191 @@ def cut(path):
 STEM = "power_drill_A60"
 PNG, MAT = f"{STEM}.png", f"{STEM}.mat"
 RAW = TRAINING / FOLDERS["raw"]
+DEPTH, FRINGE = depth_of(STEM), fringe_of(STEM)
 
 
-def png(tree, image, **place):
-    write_png(fringe_path(tree, **place), image)
+def pixel(value):
+    depth = DEPTH.copy()
+    depth[8, 12] = value
+    return depth
 
 
-def mat(tree, variant="raw", **values):
-    write_mat(depth_path(tree, variant=variant), **values)
+def rgb(change=0):
+    image = np.repeat(FRINGE[..., None], 3, axis=2)
+    image[3, 3, 0] ^= change
+    return image
+
+
+def png(image):
+    return lambda path: write_png(path, image)
+
+
+def mat(**values):
+    return lambda path: write_mat(path, **values)
+
+
+def view(tree):
+    return fringe_path(tree), depth_path(tree)
 
 
 BROKEN = {
-    "object in two splits": (move_object, "train/fringe/mug_A0.png: object mug is in two splits"),
-    "a view is missing": (remove_view, f"object power_drill lacks {STEM}"),
-    "fringe without depth": (lambda t: depth_path(t).unlink(), f"{MAT}: is missing"),
-    "depth without fringe": (lambda t: fringe_path(t).unlink(), f"{PNG}: is missing"),
-    "extra file": (
-        lambda t: (t / RAW / "test/fringe/notes.txt").write_text("x"),
-        "notes.txt: does not belong",
+    "object in two splits": (
+        Path,
+        lambda tree: move_sample(tree, "mug_A0", "train"),
+        "train/fringe/mug_A0.png: object mug is in two splits",
     ),
-    "extra folder": (lambda t: (t / RAW / "holdout").mkdir(), "holdout: does not belong"),
-    "extra folder in a split": (
-        lambda t: (t / RAW / "test/normals").mkdir(),
-        "normals: does not belong",
+    "a view is missing": (
+        view,
+        lambda paths: [path.unlink() for path in paths],
+        f"object power_drill lacks {STEM}",
     ),
-    "no fringe folder": (
-        lambda t: shutil.rmtree(t / RAW / "test/fringe"),
-        "fringe: the folder is missing",
-    ),
+    "fringe without depth": (depth_path, Path.unlink, f"{MAT}: is missing"),
+    "depth without fringe": (fringe_path, Path.unlink, f"{PNG}: is missing"),
+    "extra file": ("test/fringe/notes.txt", Path.touch, "notes.txt: does not belong"),
+    "extra folder": ("holdout", Path.mkdir, "holdout: does not belong"),
+    "extra folder in a split": ("test/normals", Path.mkdir, "normals: does not belong"),
+    "no fringe folder": ("test/fringe", shutil.rmtree, "fringe: the folder is missing"),
     "a view that is none": (
-        lambda t: move(fringe_path(t), fringe_path(t, stem="drill_A45")),
+        fringe_path,
+        lambda path: path.rename(path.with_name("drill_A45.png")),
         "drill_A45.png: expected",
     ),
-    "a link to nowhere": (lambda t: link_to_nowhere(fringe_path(t)), PNG),
-    "png cut off": (lambda t: cut(fringe_path(t)), f"{PNG}: the PNG is cut off"),
-    "png damaged": (lambda t: flip(fringe_path(t), 200), f"{PNG}: the PNG is damaged"),
+    "a link to nowhere": (fringe_path, link_to_nowhere, PNG),
+    "png cut off": (fringe_path, cut, f"{PNG}: the PNG is cut off"),
+    "png damaged": (fringe_path, flip, f"{PNG}: the PNG is damaged"),
     "no png at all": (
-        lambda t: fringe_path(t).write_bytes(b"P5 24 24 255 "),
+        fringe_path,
+        lambda path: path.write_bytes(b"P5 24 24 255 "),
         f"{PNG}: expected a PNG",
     ),
     "png of 16 bits": (
-        lambda t: png(t, np.uint16(fringe_of(STEM))),
+        fringe_path,
+        png(np.uint16(FRINGE)),
         f"{PNG}: expected an 8-bit PNG, got 16 bits",
     ),
     "png with alpha": (
-        lambda t: png(t, np.zeros((24, 24, 4), np.uint8)),
+        fringe_path,
+        png(np.zeros((24, 24, 4), np.uint8)),
         f"{PNG}: expected a grey PNG",
     ),
-    "png in colour": (rgb_with_a_colour, f"{PNG}: an RGB image whose channels differ"),
-    "png of another size": (lambda t: png(t, fringe_of(STEM)[:20]), f"{PNG}: expected 24 x 24 px"),
-    "mat cut off": (lambda t: cut(depth_path(t)), f"{MAT}: a data element"),
+    "png in colour": (fringe_path, png(rgb(1)), f"{PNG}: an RGB image whose channels differ"),
+    "png of another size": (fringe_path, png(FRINGE[:20]), f"{PNG}: expected 24 x 24 px"),
+    "mat cut off": (depth_path, cut, f"{MAT}: a data element"),
     "wrong variable": (
-        lambda t: mat(t, depthMapMeters=depth_of(STEM)),
+        depth_path,
+        mat(depthMapMeters=DEPTH),
         f"{MAT}: expected the variable depthMap, got depthMapMeters",
     ),
     "depth of another size": (
-        lambda t: mat(t, depthMap=depth_of(STEM)[:, :20]),
+        depth_path,
+        mat(depthMap=DEPTH[:, :20]),
         f"{MAT}: expected 24 x 24",
     ),
-    "depth NaN": (lambda t: set_pixel(depth_path(t), np.nan), f"{MAT}: 1 pixels are NaN"),
-    "depth negative": (lambda t: set_pixel(depth_path(t), -1), f"{MAT}: 1 pixels are negative"),
-    "depth empty": (lambda t: mat(t, depthMap=np.zeros((24, 24))), f"{MAT}: no pixel is above 0"),
+    "depth NaN": (depth_path, mat(depthMap=pixel(np.nan)), f"{MAT}: 1 pixels are NaN"),
+    "depth negative": (depth_path, mat(depthMap=pixel(-1)), f"{MAT}: 1 pixels are negative"),
+    "depth empty": (depth_path, mat(depthMap=0 * DEPTH), f"{MAT}: no pixel is above 0"),
     "depth in cm": (
-        lambda t: mat(t, depthMap=depth_of(STEM) / 10),
+        depth_path,
+        mat(depthMap=DEPTH / 10),
         "the file has another unit (times 10 it fits)",
     ),
     "depth with a mark": (
-        lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), 65535)),
+        depth_path,
+        mat(depthMap=np.where(DEPTH > 0, DEPTH, 65535)),
         f"{MAT}: 79% of the pixels are exactly 65535, far from all depths: a value for background?",
     ),
     "depth in tenths of a mm": (
-        lambda t: mat(t, depthMap=np.uint16(10 * depth_of(STEM))),
+        depth_path,
+        mat(depthMap=np.uint16(10 * DEPTH)),
         "the file has another unit (times 0.1 it fits)",
     ),
     "depth with -1": (
-        lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), -1)),
+        depth_path,
+        mat(depthMap=np.where(DEPTH > 0, DEPTH, -1)),
         f"{MAT}: 79% of the pixels are exactly -1",
     ),
-    "depth in metres": (lambda t: mat(t, depthMap=depth_of(STEM) / 1000), f"{MAT}: depths of 1.7"),
+    "depth in metres": (depth_path, mat(depthMap=DEPTH / 1000), f"{MAT}: depths of 1.7"),
 }
+"""What is changed, how, and what is said of it."""
 
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_tree_is_refused_and_the_file_named(tmp_path, case):
-    breaking, message = BROKEN[case]
+    place, change, message = BROKEN[case]
     tree = make_tree(tmp_path / "tree")
-    breaking(tree)
-    assert message in refusal(tree, tmp_path / "out")
+    change(tree / RAW / place if isinstance(place, str) else place(tree))
+    assert message in problems(tree, tmp_path / "out")
+
+
+def in_info(stem=STEM):
+    return lambda tree, variant: info_path(tree, stem=stem)
 
 
 BROKEN_VARIANTS = {
     "metres in mm": (
-        ("global",),
-        lambda t: mat(t, "global", depthMapMeters=depth_of(STEM)),
+        ["global"],
+        depth_path,
+        mat(depthMapMeters=DEPTH),
         "so the file has another unit",
     ),
     "normalised above 1": (
-        ("individual",),
-        lambda t: mat(t, "individual", depthMapNormalized=depth_of(STEM)),
+        ["individual"],
+        depth_path,
+        mat(depthMapNormalized=DEPTH),
         "in [0, 1]",
     ),
     "variants disagree": (
-        ("raw", "global"),
-        lambda t: write_mat(
-            depth_path(t, variant="global"),
-            depthMapMeters=(depth_of(STEM) + (depth_of(STEM) > 0) * 0.05) / 1000,
-        ),
+        ["raw", "global"],
+        depth_path,
+        mat(depthMapMeters=(DEPTH + (DEPTH > 0) * 0.05) / 1000),
         f"global_normalized/test/depth/{MAT}: differs from",
     ),
     "fringes of variants differ": (
-        ("raw", "global"),
-        lambda t: png(t, fringe_of("bowl_A0"), variant="global"),
+        ["raw", "global"],
+        fringe_path,
+        png(fringe_of("bowl_A0")),
         f"global_normalized/test/fringe/{PNG}: expected the same image as",
     ),
     "variants split differently": (
-        ("raw", "global"),
-        lambda t: move_to_test(t, "mug_A0", "global"),
+        ["raw", "global"],
+        lambda tree, variant: tree,
+        lambda tree: move_sample(tree, "mug_A0", "test", "global"),
         "global_normalized/val/fringe/mug_A0.png: is missing",
     ),
     "range disagrees": (
-        ("raw", "individual"),
-        lambda t: write_mat(info_path(t), depth_min=1700.0, depth_max=1900.0),
+        ["raw", "individual"],
+        in_info(),
+        mat(depth_min=1700.0, depth_max=1900.0),
         f"{MAT}: gives 1700",
     ),
     "range upside down": (
-        ("individual",),
-        lambda t: write_mat(info_path(t), depth_min=1900.0, depth_max=1700.0),
+        ["individual"],
+        in_info(),
+        mat(depth_min=1900.0, depth_max=1700.0),
         f"{MAT}: expected 0 < depth_min <= depth_max",
     ),
     "range missing": (
-        ("individual",),
-        lambda t: info_path(t).unlink(),
+        ["individual"],
+        in_info(),
+        Path.unlink,
         f"info_depth_params/test/depth/{MAT}: is missing",
     ),
     "range folder missing": (
-        ("individual",),
-        lambda t: shutil.rmtree(t / TRAINING / "info_depth_params"),
+        ["individual"],
+        lambda tree, variant: tree / TRAINING / "info_depth_params",
+        shutil.rmtree,
         "info_depth_params: the folder is missing",
     ),
     "range of no sample": (
-        ("individual",),
-        lambda t: write_mat(info_path(t, stem="mug_A0"), depth_min=1.0, depth_max=2.0),
+        ["individual"],
+        in_info("mug_A0"),
+        mat(depth_min=1.0, depth_max=2.0),
         "mug_A0.mat: belongs to no sample of this split",
     ),
     "range not a number": (
-        ("individual",),
-        lambda t: write_mat(info_path(t), depth_min=np.nan, depth_max=2.0),
+        ["individual"],
+        in_info(),
+        mat(depth_min=np.nan, depth_max=2.0),
         f"{MAT}: depth_min: expected a finite number",
     ),
 }
@@ -343,20 +345,18 @@ BROKEN_VARIANTS = {
 
 @pytest.mark.parametrize("case", BROKEN_VARIANTS)
 def test_variants_and_ranges_that_do_not_fit_together(tmp_path, case):
-    variants, breaking, message = BROKEN_VARIANTS[case]
+    variants, place, change, message = BROKEN_VARIANTS[case]
     tree = make_tree(tmp_path / "tree", variants)
-    breaking(tree)
-    assert message in refusal(tree, tmp_path / "out")
+    change(place(tree, variant=variants[-1]))
+    assert message in problems(tree, tmp_path / "out")
 
 
 def test_all_wrong_files_of_all_splits_are_listed_together(tmp_path):
     tree = make_tree(tmp_path / "tree")
     cut(fringe_path(tree, "train", "bowl_A0"))
-    set_pixel(depth_path(tree, "val", "mug_A120"), np.nan)
-    write_mat(
-        depth_path(tree, "test", "my_own_part_A300"), depthMapMeters=depth_of("my_own_part_A300")
-    )
-    message = refusal(tree, tmp_path / "out")
+    write_mat(depth_path(tree, "val", "mug_A120"), depthMap=pixel(np.nan))
+    write_mat(depth_path(tree, "test", "my_own_part_A300"), depthMapMeters=DEPTH)
+    message = problems(tree, tmp_path / "out")
     assert "3 problems" in message
     for name in ("bowl_A0.png", "mug_A120.mat", "my_own_part_A300.mat"):
         assert message.count(name) == 1
@@ -366,12 +366,9 @@ def test_a_long_list_of_wrong_files_is_cut_with_their_count(tmp_path):
     tree = make_tree(tmp_path / "tree", splits={"train": tuple(f"object_{n}" for n in range(10))})
     for path in (tree / TRAINING / FOLDERS["raw"] / "train" / "depth").iterdir():
         path.write_bytes(b"")
-    message = refusal(tree, tmp_path / "out").splitlines()
-    assert (
-        len(message) == 52
-        and "60 problems" in message[0]
-        and message[-1].strip() == "... and 10 more"
-    )
+    message = problems(tree, tmp_path / "out").splitlines()
+    assert len(message) == 52 and "60 problems" in message[0]
+    assert message[-1].strip() == "... and 10 more"
 
 
 @pytest.mark.parametrize(
@@ -392,19 +389,19 @@ def test_a_long_list_of_wrong_files_is_cut_with_their_count(tmp_path):
 )
 def test_folders_that_are_no_published_tree(tmp_path, make, message):
     make(tmp_path / "tree")
-    assert message in refusal(tmp_path / "tree", tmp_path / "out")
+    assert message in problems(tmp_path / "tree", tmp_path / "out")
 
 
 def test_an_interrupted_import_resumes_and_reads_a_changed_file_again(tmp_path, monkeypatch):
     tree = make_tree(tmp_path / "tree")
     expected = imported(tree, tmp_path / "whole").fingerprint
     reader = plan_import(tree).rows.__class__
-    read = reader.read
-    read_samples = []
+    read, read_samples = reader.read, []
 
     def interrupted(self, sample):
-        if sample.split == "test":
+        if sample.split == "test" and not read_samples:
             raise KeyboardInterrupt
+        return read(self, sample)
         return read(self, sample)
 
     monkeypatch.setattr(reader, "read", interrupted)
@@ -415,15 +412,14 @@ def test_an_interrupted_import_resumes_and_reads_a_changed_file_again(tmp_path, 
     os.utime(changed_file, (0, 0))  # an old modification time does not hide a change
     write_mat(changed_file, depthMap=depth_of("mug_A0") + np.float32(1) * (depth_of("mug_A0") > 0))
 
-    monkeypatch.setattr(
-        reader,
-        "read",
-        lambda self, sample: (read_samples.append(sample.sample), read(self, sample))[1],
-    )
+    def noted(self, sample):
+        read_samples.append(sample.sample)
+        return read(self, sample)
+
+    monkeypatch.setattr(reader, "read", noted)
     dataset = imported(tree, tmp_path / "out")
-    assert (
-        not any(sample.startswith("bowl") for sample in read_samples) and "mug_A0" in read_samples
-    )
+    assert "mug_A0" in read_samples
+    assert not any(sample.startswith("bowl") for sample in read_samples)
     assert dataset.depth_mm("mug_A0").max() == depth_of("mug_A0").max() + 1
     changed_file.write_bytes(content)
     shutil.rmtree(tmp_path / "out")
@@ -439,48 +435,31 @@ def test_a_finished_import_is_left_alone_unless_the_tree_changed(tmp_path):
         imported(tree, tmp_path / "out")
 
 
-def test_the_command_imports_and_prints_a_summary(tmp_path, capsys):
+def test_the_command_imports_and_prints_a_summary(tmp_path):
     tree = make_tree(tmp_path / "tree", ALL_VARIANTS)
     save_rig(paper_rig(24), tmp_path / "rig.yaml")
-    assert (
-        command(
-            "import",
-            tree,
-            "--out",
-            tmp_path / "out",
-            "--workers",
-            1,
-            "--rig",
-            tmp_path / "rig.yaml",
-        )
-        == 0
-    )
-    message = capsys.readouterr().out
-    assert (
-        "train 6, validation 6, test 12 samples" in message
-        and f"depth taken from {FOLDERS['raw']}" in message
-    )
-    assert "assumed" not in message
+    line = f"import {tree} --out {tmp_path}/out --workers 1 --rig {tmp_path}/rig.yaml"
+    message = printed(fpp_bench, line)
+    assert "train 6, validation 6, test 12 samples" in message
+    assert f"depth taken from {FOLDERS['raw']}" in message and "assumed" not in message
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        ("import", "tree", "--out", "out", "--frame-order", "sideways"),
-        ("import", "tree", "--out", "out", "--rig", "nowhere.yaml"),
-        ("import", "tree", "--out", "tree"),
-        ("import", "tree", "--out", "a_file"),
-        ("import", "broken", "--out", "out"),
+        "tree --out out --frame-order sideways",
+        "tree --out out --rig nowhere.yaml",
+        "tree --out tree",
+        "tree --out a_file",
+        "broken --out out",
     ],
 )
-def test_bad_input_to_the_command_is_a_message_and_status_2(tmp_path, monkeypatch, capsys, words):
+def test_bad_input_to_the_command_is_a_message_and_status_2(tmp_path, monkeypatch, words):
     make_tree(tmp_path / "tree")
     cut(depth_path(make_tree(tmp_path / "broken")))
     (tmp_path / "a_file").write_text("")
     monkeypatch.chdir(tmp_path)
-    assert command(*words) == 2
-    message = capsys.readouterr().err
-    assert "error:" in message and "Traceback" not in message
+    assert "error:" in refusal(fpp_bench, "import", words)
     assert not (tmp_path / "out" / "manifest.json").exists()
 
 
@@ -490,19 +469,19 @@ def test_a_value_for_background_is_read_as_0(mark, tmp_path):
     for file in (marked / RAW).rglob("*.mat"):
         depth = scipy.io.loadmat(file)["depthMap"]
         write_mat(file, depthMap=np.where(depth > 0, depth, np.float32(mark)))
-    assert command("import", plain, "--out", tmp_path / "a", "--workers", 1) == 0
-    assert command("import", marked, "--out", tmp_path / "b", "--workers", 1, "--nodata", mark) == 0
+    line = f"--workers 1 --out {tmp_path}"
+    assert fpp_bench("import", plain, f"{line}/a") == 0
+    assert fpp_bench("import", marked, f"{line}/b --nodata", mark) == 0
     assert DatasetFolder(tmp_path / "a").content == DatasetFolder(tmp_path / "b").content
 
 
 def test_whole_numbers_are_said(tmp_path, capsys):
     tree = make_tree(tmp_path / "tree")
-    assert command("import", tree, "--out", tmp_path / "a", "--workers", 1) == 0
+    line = f"import {tree} --workers 1 --out {tmp_path}"
+    assert fpp_bench(f"{line}/a") == 0
     assert "warning" not in capsys.readouterr().err
     for file in (tree / RAW).rglob("*.mat"):
         write_mat(file, depthMap=np.uint16(np.rint(scipy.io.loadmat(file)["depthMap"])))
-    assert command("import", tree, "--out", tmp_path / "b", "--workers", 1) == 0
-    assert (
-        "warning: the depth files hold whole numbers, so depth is rounded"
-        in capsys.readouterr().err
-    )
+    assert fpp_bench(f"{line}/b") == 0
+    said = "warning: the depth files hold whole numbers, so depth is rounded"
+    assert said in capsys.readouterr().err

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import TINY_SIZE
+from conftest import TINY_SIZE, fpp_bench, printed
 
 from fpp_ml_bench.calibration.volume import volume_error_mm
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import BuildError, CalibrationError
 from fpp_ml_bench.loaders.render.builder import assembly_of, build
@@ -33,18 +32,8 @@ def lab(tmp_path_factory):
     """Folder of a dataset built by the command with --decode-with, and the dataset."""
     folder = tmp_path_factory.mktemp("lab")
     save_rig(FOUND, folder / "found.yaml")
-    asked = [
-        "build",
-        "--out",
-        str(folder / "data"),
-        "--objects",
-        "cork",
-        "--size",
-        str(TINY_SIZE),
-        "--workers",
-        "1",
-    ]
-    assert main([*asked, "--decode-with", str(folder / "found.yaml")]) == 0
+    line = f"build --out {folder}/data --objects cork --size {TINY_SIZE} --workers 1"
+    assert fpp_bench(line, "--decode-with", folder / "found.yaml") == 0
     return DatasetFolder(folder / "data")
 
 
@@ -61,23 +50,17 @@ def test_frames_and_exact_depth_are_the_true_rigs_and_depth_and_rig_the_found_on
         assert lab.measured(sample)["gt_rmse_mm"] > 1.5 * opened.measured(sample)["gt_rmse_mm"]
 
 
-def test_info_says_that_another_rig_photographed_and_how_far_both_are_apart(
-    lab, opened, tiny, capsys
-):
+def test_info_says_that_another_rig_photographed_and_how_far_both_are_apart(lab, opened, tiny):
     error = volume_error_mm(FOUND, TRUE)
-    assert main(["info", str(lab.path)]) == 0
-    out = capsys.readouterr().out
-    assert (
-        "photographed by another" in out
-        and f"{error.rms_mm:.3f} mm RMS" in out
-        and "photographed_by" not in out
+    out = printed(fpp_bench, "info", lab.path)
+    assert "photographed by another" in out and f"{error.rms_mm:.3f} mm RMS" in out
+    assert "photographed_by" not in out
+    of_lab, of_tiny = (
+        json.loads(printed(fpp_bench, "info --json -", path)) for path in (lab.path, tiny)
     )
-    assert main(["info", str(lab.path), "--json", "-"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert content["calibration_error"] == pytest.approx(error._asdict())
-    assert content["settings"]["photographed_by"]["translation_m"] == [0.125, -0.1, 0.0]
-    assert main(["info", str(tiny), "--json", "-"]) == 0
-    assert json.loads(capsys.readouterr().out)["calibration_error"] is None
+    assert of_lab["calibration_error"] == pytest.approx(error._asdict())
+    assert of_lab["settings"]["photographed_by"]["translation_m"] == [0.125, -0.1, 0.0]
+    assert of_tiny["calibration_error"] is None
     assert "photographed_by" not in opened.manifest.settings
 
 

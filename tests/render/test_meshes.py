@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import yaml
 from scipy.spatial.transform import Rotation
 
 from fpp_ml_bench.constants import OBJECTS
@@ -139,29 +138,24 @@ def part(tmp_path, wedge):
     return path
 
 
-def write_list(folder, content):
+def write_list(folder, text):
     path = folder / "list.yaml"
-    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    path.write_text(text)
     return path
 
 
 def test_list_reads_every_key(part):
-    entry = {
-        "name": "my_part",
-        "path": part.name,
-        "scale": 0.001,
-        "rotation_deg": [90, 0, 0.5],
-        "offset_m": [0, 0, 0.1],
-        "centre": False,
-        "split": "train",
-    }
-    (mesh,) = read_mesh_list(write_list(part.parent, [entry]))
+    entry = (
+        f"- {{name: my_part, path: {part.name}, scale: 0.001, rotation_deg: [90, 0, 0.5], "
+        "offset_m: [0, 0, 0.1], centre: false, split: train}"
+    )
+    (mesh,) = read_mesh_list(write_list(part.parent, entry))
     assert mesh == UserMesh(
         "my_part", str(part), 0.001, (90.0, 0.0, 0.5), (0.0, 0.0, 0.1), False, "train", mesh.content
     )
     assert len(mesh.content) == 32
     part.write_bytes(part.read_bytes()[:-1] + b"x")
-    (changed,) = read_mesh_list(write_list(part.parent, [entry]))
+    (changed,) = read_mesh_list(part.parent / "list.yaml")
     assert changed.content != mesh.content
 
 
@@ -171,42 +165,31 @@ def test_single_mesh_is_named_after_its_file(part):
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("text", "says"),
     [
         ("", "expected a list"),
         ("[1, 2]", "entry 1:\n  the file as a whole: Input should be a valid dictionary"),
-        ([{"name": "x"}], "path: is missing"),
-        ([{"name": "x", "path": "PART", "sclae": 2}], "sclae: is not a key"),
-        ([{"name": "X y", "path": "PART"}], "name: String should match"),
-        ([{"name": "mug", "path": "PART"}], "one of the benchmark's own"),
-        ([{"name": "gear", "path": "PART"}], "one of the benchmark's own"),
-        ([{"name": "x", "path": "nothing.stl"}], "no mesh file"),
+        ("- {name: x}", "path: is missing"),
+        ("- {name: x, path: PART, sclae: 2}", "sclae: is not a key"),
+        ("- {name: X y, path: PART}", "name: String should match"),
+        ("- {name: mug, path: PART}", "one of the benchmark's own"),
+        ("- {name: gear, path: PART}", "one of the benchmark's own"),
+        ("- {name: x, path: nothing.stl}", "no mesh file"),
+        ("- {name: x, path: PART, split: val}", r"split: Input should be .* \(got 'val'\)"),
+        ("- {name: x, path: PART, scale: 0}", "scale: Input should be greater than 0"),
+        ("- {name: x, path: PART, scale: true}", "scale: Input should be a valid number"),
+        ("- {name: x, path: PART, rotation_deg: [0, 0]}", "rotation_deg.2: is missing"),
         (
-            [{"name": "x", "path": "PART", "split": "val"}],
-            r"split: Input should be .* \(got 'val'\)",
-        ),
-        ([{"name": "x", "path": "PART", "scale": 0}], "scale: Input should be greater than 0"),
-        ([{"name": "x", "path": "PART", "scale": True}], "scale: Input should be a valid number"),
-        ([{"name": "x", "path": "PART", "rotation_deg": [0, 0]}], "rotation_deg.2: is missing"),
-        (
-            [{"name": "x", "path": "PART", "offset_m": [0, 0, None]}],
+            "- {name: x, path: PART, offset_m: [0, 0, null]}",
             "offset_m.2: Input should be a valid number",
         ),
-        (
-            [{"name": "x", "path": "PART", "centre": "yes"}],
-            "centre: Input should be a valid boolean",
-        ),
-        ([{"name": "x", "path": "PART"}, {"name": "x", "path": "PART"}], "given twice"),
-        ([{"name": "ok", "path": "PART"}, {"name": "x", "path": "PART", "scale": 0}], "entry 2"),
+        ("- {name: x, path: PART, centre: 'yes'}", "centre: Input should be a valid boolean"),
+        ("- {name: x, path: PART}\n- {name: x, path: PART}", "given twice"),
+        ("- {name: ok, path: PART}\n- {name: x, path: PART, scale: 0}", "entry 2"),
     ],
 )
-def test_bad_lists_are_refused(part, content, says):
-    if isinstance(content, list):
-        content = [
-            {k: part.name if v == "PART" else v for k, v in e.items()} if isinstance(e, dict) else e
-            for e in content
-        ]
-    path = write_list(part.parent, content)
+def test_bad_lists_are_refused(part, text, says):
+    path = write_list(part.parent, text.replace("PART", part.name))
     with pytest.raises(MeshError, match=says) as caught:
         read_mesh_list(path)
     assert str(path) in str(caught.value)

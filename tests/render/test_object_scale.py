@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from conftest import fpp_bench, printed, refusal
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
@@ -19,16 +19,15 @@ from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 SIZE = 192
 
 
-def test_a_rig_a_third_as_large_sees_the_same_in_a_third_of_the_depth() -> None:
+def test_a_rig_a_third_as_large_sees_the_same_in_a_third_of_the_depth():
     light = named_light("workshop").changed("camera", read_noise_e=0.1, full_well_e=1e6)
-    rig = paper_rig(SIZE)
-    rows = []
-    for one, scale in ((rig, 1.0), (rig.times(0.3), 0.3)):
-        settings = BuildSettings(one, ("mug",), light=light, object_scale=scale)
-        rows.append(Studio(settings).photograph(settings.sized(solid_mesh("mug")), "A60"))
-        frames = {index: frame.copy() for index, frame in rows[-1].frames.items()}
-        rows[-1] = replace(rows[-1], frames=frames)
-    natural, small = rows
+
+    def photographed(scale):
+        rig = paper_rig(SIZE).times(scale)
+        settings = BuildSettings(rig, ("mug",), light=light, object_scale=scale)
+        return Studio(settings).photograph(settings.sized(solid_mesh("mug")), "A60")
+
+    natural, small = photographed(1.0), photographed(0.3)
     assert np.abs(small.depth_exact_mm - 0.3 * natural.depth_exact_mm).max() < 1e-3
     assert small.measured["distance_mm"] == pytest.approx(0.3 * natural.measured["distance_mm"])
     for index in (0, 20, 40):
@@ -39,7 +38,7 @@ def test_a_rig_a_third_as_large_sees_the_same_in_a_third_of_the_depth() -> None:
     assert np.median(np.abs(small.depth_mm - 0.3 * natural.depth_mm)[both]) < 0.01
 
 
-def test_the_volume_of_a_rig_tells_how_large_objects_may_be() -> None:
+def test_the_volume_of_a_rig_tells_how_large_objects_may_be():
     for rig in (paper_rig(), paper_rig(224), crossed_rig(1280)):
         assert volume_scale(rig) == 1.0
     assert volume_scale(paper_rig().times(0.2505)) == 0.25
@@ -52,7 +51,7 @@ def test_the_volume_of_a_rig_tells_how_large_objects_may_be() -> None:
             BuildSettings(paper_rig(SIZE), ("mug",), object_scale=scale)
 
 
-def test_users_meshes_keep_their_size() -> None:
+def test_users_meshes_keep_their_size():
     own = UserMesh("mine", "mine.stl")
     settings = BuildSettings(
         paper_rig(SIZE).times(0.5), ("mine", "mug"), user_meshes=(own,), object_scale=0.5
@@ -62,17 +61,17 @@ def test_users_meshes_keep_their_size() -> None:
     assert np.array_equal(settings.sized(mug).vertices_m, 0.5 * mug.vertices_m)
 
 
-def test_the_command_scales_and_says_so(tmp_path, capsys) -> None:
+def test_the_command_scales_and_says_so(tmp_path):
     file = tmp_path / "near.yaml"
     file.write_text(yaml.safe_dump(paper_rig(SIZE).times(0.3).to_dict()))
-    build = f"build --rig {file} --objects cork --light workshop --workers 1 --out"
-    assert main([*build.split(), str(tmp_path / "set")]) == 0
-    assert "objects, textures and focus are 0.3 times as large" in capsys.readouterr().out
+    build = f"build --rig {file} --objects cork --light workshop --workers 1 --out {tmp_path}"
+    said = printed(fpp_bench, f"{build}/set")
+    assert "objects, textures and focus are 0.3 times as large" in said
     dataset = DatasetFolder(tmp_path / "set")
     settings = json.loads((tmp_path / "set" / "manifest.json").read_text())["settings"]
     assert settings["object_scale"] == 0.3
     assert settings["light"]["projector"]["focus_m"] == pytest.approx(1.8)
     depth_mm = dataset.target_mm(dataset.samples("train")[0], "depth_exact")
     assert 450 < depth_mm[depth_mm > 0].mean() < 630
-    assert main([*build.split(), str(tmp_path / "own"), "--object-scale", "1"]) == 2
-    assert "does not fit the working range" in capsys.readouterr().err
+    said = refusal(fpp_bench, f"{build}/own --object-scale 1")
+    assert "does not fit the working range" in said

@@ -3,6 +3,7 @@ scene statistics."""
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,27 +30,18 @@ ALL = (*OBJECTS, *UNSEEN)
 MARGIN_PX = 6  # of the 960: no object may come nearer to the image border
 
 
-@pytest.fixture(scope="module")
-def meshes():
-    return {name: _mesh(name) for name in ALL}
-
-
-@pytest.fixture(scope="module")
-def views(meshes):
-    """Visible depths in mm of each object's six views, on a coarse grid of the paper's camera."""
-    return {name: _visible_depths_mm(solid_mesh(name)) for name in meshes}
-
-
-def _mesh(name):
+@cache
+def mesh_of(name):
     solid = solid_mesh(name)
     return trimesh.Trimesh(solid.vertices_m, solid.faces, process=False, validate=False)
 
 
-def _visible_depths_mm(solid):
-    """For each view, depth (n,) of the pixels that hit; the camera stands 1.8 m before the turning
-    axis."""
+@cache
+def views_of(name):
+    """Visible depths (n,) in mm of an object's six views, on a coarse grid of the paper's camera,
+    which stands 1.8 m before the turning axis."""
     line = (np.arange(SIZE) - (SIZE - 1) / 2) * IMAGE_PX / SIZE / FOCAL_PX
-    rays = PixelRays(*np.meshgrid(line, line))
+    rays, solid = PixelRays(*np.meshgrid(line, line)), solid_mesh(name)
     placed = (
         np.add(turned(solid.vertices_m, degrees), [0, 0, STANDOFF_M]) for degrees in VIEW_DEGREES
     )
@@ -103,15 +95,15 @@ def test_the_unseen_objects_are_others_and_all_in_the_test_split():
     ],
     ids=["vessels", "concave"],
 )
-def test_hollow_ones_are_far_from_their_hull(meshes, most_of_hull, names):
+def test_hollow_ones_are_far_from_their_hull(most_of_hull, names):
     """Parts of them see each other: there the light of further bounces counts."""
     for name in names:
-        assert meshes[name].volume < most_of_hull * meshes[name].convex_hull.volume, name
+        assert mesh_of(name).volume < most_of_hull * mesh_of(name).convex_hull.volume, name
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_mesh_is_a_closed_solid(meshes, name):
-    mesh = meshes[name]
+def test_mesh_is_a_closed_solid(name):
+    mesh = mesh_of(name)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
     assert mesh.volume > 0
@@ -123,8 +115,8 @@ def test_mesh_is_a_closed_solid(meshes, name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_mesh_is_centred_and_within_the_working_range(meshes, name):
-    vertices = meshes[name].vertices
+def test_mesh_is_centred_and_within_the_working_range(name):
+    vertices = mesh_of(name).vertices
     np.testing.assert_allclose(vertices.min(axis=0) + vertices.max(axis=0), 0, atol=1e-12)
     near, far = (depth / 1000 for depth in WORKING_RANGE_MM)
     assert (
@@ -139,34 +131,26 @@ def test_mesh_is_centred_and_within_the_working_range(meshes, name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_view_covers_3_to_40_percent(views, name):
-    cover = np.array([len(depth) / SIZE**2 for depth in views[name]])
-    assert cover.min() >= 0.03
-    assert cover.max() <= 0.40
+def test_every_view_covers_3_to_40_percent(name):
+    cover = [len(depth) / SIZE**2 for depth in views_of(name)]
+    assert min(cover) >= 0.03 and max(cover) <= 0.40
 
 
-def test_covers_and_depth_ranges_are_the_papers(views):
-    views = {name: views[name] for name in OBJECTS}
-    cover = np.array([len(depth) / SIZE**2 for sample in views.values() for depth in sample])
-    spread = {name: [np.ptp(depth) for depth in sample] for name, sample in views.items()}
-    assert 0.09 <= cover.mean() <= 0.11
-    assert cover.max() >= 0.30
-    assert 70 <= np.median([value for sample in spread.values() for value in sample]) <= 90
+def test_covers_and_depth_ranges_are_the_papers():
+    cover = np.array([len(depth) / SIZE**2 for name in OBJECTS for depth in views_of(name)])
+    spread = {name: [np.ptp(depth) for depth in views_of(name)] for name in OBJECTS}
+    assert 0.09 <= cover.mean() <= 0.11 and cover.max() >= 0.30
+    assert 70 <= np.median(list(spread.values())) <= 90
     deepest = max(spread, key=lambda name: max(spread[name]))
-    assert deepest == "wooden_boards"
-    assert 445 <= max(spread[deepest]) <= 475
+    assert deepest == "wooden_boards" and 445 <= max(spread[deepest]) <= 475
 
 
-def test_no_view_is_flat(views):
-    """A view of one single depth would have no range to normalise by."""
-    assert min(np.ptp(depth) for sample in views.values() for depth in sample) > 5
-
-
-def test_six_views_of_an_object_differ(views):
-    """Nothing is so round that two of its views are the same picture."""
-    for name, sample in views.items():
-        prints = {depth.round(3).tobytes() for depth in sample}
-        assert len(prints) == len(VIEW_DEGREES), name
+@pytest.mark.parametrize("name", ALL)
+def test_no_view_is_flat_and_six_views_of_an_object_differ(name):
+    """A view of one single depth would have no range to normalise by; nothing is so round that two
+    of its views are the same picture."""
+    assert min(np.ptp(depth) for depth in views_of(name)) > 5
+    assert len({depth.round(3).tobytes() for depth in views_of(name)}) == len(VIEW_DEGREES)
 
 
 def test_an_unknown_name_is_refused_with_near_ones():

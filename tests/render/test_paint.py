@@ -27,6 +27,16 @@ LINEAR_GREY = ((GREY / 255 + 0.055) / 1.055) ** 2.4
 QUAD = "v 0 -0.1 -0.1\nv 0 0.1 -0.1\nv 0 0.1 0.1\nv 0 -0.1 0.1\n"
 
 
+def loaded(path):
+    return load_user_mesh(UserMesh(path.stem, str(path)))
+
+
+def glb_header(content):
+    """Length of the header of a GLB, and what it holds."""
+    length = struct.unpack_from("<I", content, 12)[0]
+    return length, json.loads(content[20 : 20 + length])
+
+
 def write_quad(folder, image, name="quad.obj"):
     """A square of 0.2 m that faces the first view, as OBJ, MTL and PNG; u to its +y, v up."""
     text = (
@@ -98,9 +108,7 @@ def test_a_quad_has_the_colours_of_its_image(tmp_path):
     """Also where they lie: u runs to the right, and up in the image is up in v."""
     image = two_colours()
     image[:32, :32] = 255  # white above on the left
-    mesh = load_user_mesh(
-        UserMesh("quad", str(write_quad(tmp_path, image)), rotation_deg=(0, 0, 0))
-    )
+    mesh = loaded(write_quad(tmp_path, image))
     points = [(0, -0.06, 0.03), (0, -0.02, -0.08), (0, 0.02, 0.03), (0, 0.09, -0.09)]
     np.testing.assert_allclose(luminance(mesh, points), [1, 0, LINEAR_GREY, LINEAR_GREY], atol=1e-6)
 
@@ -110,12 +118,12 @@ def test_weights_in_a_triangle_without_an_area_are_those_of_a_corner():
 
 
 def test_a_glb_of_it_has_them_too(tmp_path):
-    loaded = trimesh.load(write_quad(tmp_path, two_colours()), force="mesh", process=False)
-    loaded.visual.material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=loaded.visual.material.image, baseColorFactor=[51, 51, 51, 255]
+    mesh = trimesh.load(write_quad(tmp_path, two_colours()), force="mesh", process=False)
+    mesh.visual.material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=mesh.visual.material.image, baseColorFactor=[51, 51, 51, 255]
     )
-    loaded.export(tmp_path / "quad.glb")
-    mesh = load_user_mesh(UserMesh("quad", str(tmp_path / "quad.glb")))
+    mesh.export(tmp_path / "quad.glb")
+    mesh = loaded(tmp_path / "quad.glb")
     assert mesh.paint is not None and len(mesh.paint.images) == 1
     seen = luminance(mesh, [(0, -0.05, 0.03), (0, 0.05, 0.03)])
     np.testing.assert_allclose(
@@ -129,7 +137,7 @@ def test_vertex_colours_are_interpolated_in_linear_light(tmp_path, suffix):
     colours = np.array([[0, 0, 0, 255], [GREY, GREY, GREY, 255], [255, 0, 0, 255]], dtype=np.uint8)
     path = tmp_path / f"triangle.{suffix}"
     trimesh.Trimesh(vertices, [[0, 1, 2]], vertex_colors=colours, process=False).export(path)
-    mesh = load_user_mesh(UserMesh("triangle", str(path)))
+    mesh = loaded(path)
     grey = GREY / 255 if suffix == "glb" else LINEAR_GREY  # glTF stores them linear
     weights = np.array([[0.2, 0.5, 0.3], [0, 0, 1], [0.5, 0.5, 0]])
     points = weights @ np.array(vertices)
@@ -150,7 +158,7 @@ def test_face_colours_and_material_colours(tmp_path):
         f"newmtl grey\nKd {3 * f'{GREY / 255} '}\nnewmtl green\nKd 0 1 0\n"
     )
     for name in ("faces.ply", "two.obj"):
-        mesh = load_user_mesh(UserMesh("quad", str(tmp_path / name)))
+        mesh = loaded(tmp_path / name)
         points = [(0, 0.06, -0.03), (0, -0.06, 0.03)]
         np.testing.assert_allclose(luminance(mesh, points), [LINEAR_GREY, 0.7152], atol=1e-6)
 
@@ -161,7 +169,7 @@ def test_meshes_without_colours_have_no_paint(tmp_path):
         QUAD + "vt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/2\n"
     )
     for name in ("plain.obj", "places.obj"):
-        assert load_user_mesh(UserMesh("quad", str(tmp_path / name))).paint is None
+        assert loaded(tmp_path / name).paint is None
 
 
 @pytest.fixture(scope="module")
@@ -173,14 +181,10 @@ def light() -> Light:
 
 
 def photographed(path, light):
-    """White frame (H, W) of a mesh in the first view, the studio and its trace."""
-    settings = BuildSettings(
-        paper_rig(176), ("quad",), light=light, user_meshes=(UserMesh("quad", str(path)),)
-    )
-    studio = Studio(settings)
-    mesh = load_user_mesh(settings.user_meshes[0])
-    scene = studio.trace(mesh, "A0")
-    return studio, scene
+    """Trace of the first view of a mesh."""
+    mesh = UserMesh("quad", str(path))
+    settings = BuildSettings(paper_rig(176), ("quad",), light=light, user_meshes=(mesh,))
+    return Studio(settings).trace(load_user_mesh(mesh), "A0")
 
 
 def test_a_photograph_of_the_quad_has_both_albedos(tmp_path, light):
@@ -188,7 +192,7 @@ def test_a_photograph_of_the_quad_has_both_albedos(tmp_path, light):
     white = np.full((64, 64, 3), 255, dtype=np.uint8)
     gains = []
     for image in (two_colours(), white):
-        _, scene = photographed(write_quad(tmp_path, image), light)
+        scene = photographed(write_quad(tmp_path, image), light)
         gains.append((scene.lit.gain, scene.mixed_lit.gain))
     half, whole = gains
     ratio = half[0] / whole[0]
@@ -206,7 +210,7 @@ def test_a_photograph_of_the_quad_has_both_albedos(tmp_path, light):
 
 
 def test_without_textures_the_albedo_is_even(tmp_path):
-    mesh = load_user_mesh(UserMesh("quad", str(write_quad(tmp_path, two_colours()))))
+    mesh = loaded(write_quad(tmp_path, two_colours()))
     surface = named_light("paper").changed("surface", textures="none").surface
     assert (
         material_of(mesh, np.zeros((1, 3)), np.zeros((1, 3)), surface, np.array([0])).albedo == 0.8
@@ -216,18 +220,18 @@ def test_without_textures_the_albedo_is_even(tmp_path):
 def test_triangles_without_an_area_do_not_shift_the_colours(tmp_path, light):
     """They are not traced, but count as rows of the faces."""
     text = write_quad(tmp_path, two_colours()).read_text()
-    _, before = photographed(tmp_path / "quad.obj", light)
+    before = photographed(tmp_path / "quad.obj", light)
     (tmp_path / "quad.obj").write_text(
         text.replace("usemtl paint\n", "usemtl paint\nf 1/1 1/1 2/2\nf 2/2 3/3 2/2\n")
     )
-    _, after = photographed(tmp_path / "quad.obj", light)
+    after = photographed(tmp_path / "quad.obj", light)
     np.testing.assert_allclose(after.lit.gain, before.lit.gain, rtol=1e-5)
     assert after.hits.triangle.min() >= 0
 
 
 def test_points_of_surfels_know_their_triangles(tmp_path):
     """On an open surface too, whose points lie on both sides."""
-    mesh = load_user_mesh(UserMesh("quad", str(write_quad(tmp_path, two_colours()))))
+    mesh = loaded(write_quad(tmp_path, two_colours()))
     points = Surfels.of(mesh).points
     corners = mesh.vertices_m[mesh.faces[points.triangle]]
     weights = barycentric(corners, points.position_m)
@@ -269,30 +273,27 @@ def test_damaged_textures_are_refused_in_words(tmp_path, damage, says):
     )
     damage(tmp_path / "quad.png")
     with pytest.raises(MeshError, match=says) as caught:
-        load_user_mesh(UserMesh("quad", str(path)))
+        loaded(path)
     assert str(path) in str(caught.value)
 
 
 def test_a_damaged_image_inside_a_glb_is_refused(tmp_path):
-    trimesh.load(write_quad(tmp_path, two_colours()), force="mesh", process=False).export(
-        tmp_path / "quad.glb"
-    )
-    content = bytearray((tmp_path / "quad.glb").read_bytes())
-    length = struct.unpack_from("<I", content, 12)[0]
-    header = json.loads(content[20 : 20 + length])
-    start = (
-        28 + length + header["bufferViews"][header["images"][0]["bufferView"]].get("byteOffset", 0)
-    )
+    file = tmp_path / "quad.glb"
+    trimesh.load(write_quad(tmp_path, two_colours()), force="mesh", process=False).export(file)
+    content = bytearray(file.read_bytes())
+    length, header = glb_header(content)
+    view = header["bufferViews"][header["images"][0]["bufferView"]]
+    start = 28 + length + view.get("byteOffset", 0)
     content[start : start + 8] = bytes(8)
-    (tmp_path / "quad.glb").write_bytes(content)
+    file.write_bytes(content)
     with pytest.raises(MeshError, match="can't be read"):
-        load_user_mesh(UserMesh("quad", str(tmp_path / "quad.glb")))
+        loaded(file)
 
 
 @pytest.mark.parametrize("suffixes", [("obj", "mtl", "png"), ("glb",)], ids=["obj", "glb"])
 def test_changed_bytes_give_a_mesh_or_words(tmp_path, suffixes):
-    loaded = trimesh.load(write_quad(tmp_path, two_colours(16)), force="mesh", process=False)
-    loaded.export(tmp_path / "quad.glb")
+    mesh = trimesh.load(write_quad(tmp_path, two_colours(16)), force="mesh", process=False)
+    mesh.export(tmp_path / "quad.glb")
     random, refused = np.random.default_rng(9), 0
     originals = {
         tmp_path / f"quad.{suffix}": (tmp_path / f"quad.{suffix}").read_bytes()
@@ -305,7 +306,7 @@ def test_changed_bytes_give_a_mesh_or_words(tmp_path, suffixes):
                 content[place] = random.integers(0, 256)
             file.write_bytes(content)
         try:
-            mesh = load_user_mesh(UserMesh("quad", str(tmp_path / f"quad.{suffixes[0]}")))
+            mesh = loaded(tmp_path / f"quad.{suffixes[0]}")
         except MeshError:
             refused += 1
             continue
@@ -339,7 +340,7 @@ def test_what_a_mesh_names_must_be_a_regular_file(tmp_path, name, kind):
         MeshError,
         match=rf"^{path}: names the file '{name}', which is not (a regular file|beside it)",
     ):
-        load_user_mesh(UserMesh("quad", str(path)))
+        loaded(path)
 
 
 def test_textures_are_counted_by_their_headers_before_any_is_decoded(tmp_path):
@@ -353,14 +354,12 @@ def test_textures_are_counted_by_their_headers_before_any_is_decoded(tmp_path):
     with pytest.raises(
         MeshError, match=r"has textures of 134234112 px, expected 134217728; shrink them"
     ):
-        load_user_mesh(UserMesh("quad", str(path)))
+        loaded(path)
 
 
 def test_a_mesh_without_end_is_refused_by_its_header(tmp_path):
-    scene = trimesh.Scene(trimesh.creation.box())
-    content = scene.export(file_type="glb")
-    length = struct.unpack_from("<I", content, 12)[0]
-    header = json.loads(content[20 : 20 + length])
+    content = trimesh.Scene(trimesh.creation.box()).export(file_type="glb")
+    length, header = glb_header(content)
     header["nodes"] = header["nodes"][:1] + [{"mesh": 0}] * 20_001
     header["nodes"][0] = {"children": list(range(1, len(header["nodes"])))}
     text = json.dumps(header).encode()
@@ -370,17 +369,17 @@ def test_a_mesh_without_end_is_refused_by_its_header(tmp_path):
     with pytest.raises(
         MeshError, match=r"many\.glb: has 20002 parts, expected at most 20000; join them"
     ):
-        load_user_mesh(UserMesh("many", str(tmp_path / "many.glb")))
+        loaded(tmp_path / "many.glb")
 
 
 def test_materials_that_share_a_texture_hold_it_once(tmp_path):
     path = write_quad(tmp_path, two_colours())
-    once = load_user_mesh(UserMesh("quad", str(path))).paint
+    once = loaded(path).paint
     material = (tmp_path / "quad.mtl").read_text()
     (tmp_path / "quad.mtl").write_text(material + material.replace("newmtl paint", "newmtl again"))
     text = path.read_text().splitlines()
     faces = [line for line in text if line.startswith("f ")]
     path.write_text("\n".join([*text, "usemtl again", *faces]) + "\n")
-    twice = load_user_mesh(UserMesh("quad", str(path))).paint
+    twice = loaded(path).paint
     assert len(once.images) == len(twice.images) == 1 and len(twice.image) == 2 * len(once.image)
     np.testing.assert_array_equal(once.images[0], twice.images[0])

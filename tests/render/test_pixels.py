@@ -27,11 +27,11 @@ def plate(left_px, right_px, top_px=20.0, bottom_px=150.0, z_m=1.8):
     return [x0, y0, z_m], [x1 - x0, 0, 0], [0, y1 - y0, 0]
 
 
-def mixed(*rectangles, across=4):
-    mesh = sheet(*rectangles)
-    traced = TracedObject(mesh, mesh.vertices_m)
-    hits = traced.primary(PixelRays.of(RIG.camera))
-    return hits, mixed_pixels(traced, hits, RIG, across)
+def mixed(mesh, at_m=(0.0, 0.0, 0.0), across=4, rig=RIG):
+    """What the central rays see of a mesh, and its mixed pixels."""
+    traced = TracedObject(mesh, np.add(mesh.vertices_m, at_m))
+    hits = traced.primary(PixelRays.of(rig.camera))
+    return hits, mixed_pixels(traced, hits, rig, across)
 
 
 def image_of(pixels, values, rest=0.0):
@@ -44,7 +44,8 @@ def image_of(pixels, values, rest=0.0):
 def test_a_pixel_that_is_partly_covered(across, quarters):
     """The left edge of a sheet runs ``quarters`` quarters from the right side of the pixels of
     column 60."""
-    hits, found = mixed(plate(60.5 - quarters / 4 + 0.01, 120.49, 20.51, 150.49), across=across)
+    sides = plate(60.5 - quarters / 4 + 0.01, 120.49, 20.51, 150.49)
+    hits, found = mixed(sheet(sides), across=across)
     cover = image_of(found.pixels, (found.triangle >= 0).reshape(-1, across**2).mean(axis=1))
     assert (cover[21:151, 60] == quarters / 4).all()
     assert np.count_nonzero(cover) == 130  # no other pixel mixes
@@ -81,59 +82,45 @@ def test_a_tilted_plane_mixes_nothing():
             1.8 / (1 - slope * rays[:, :1])
         )  # z = 1.8 + slope x, beyond the image all around
         mesh = replace(sheet(plate(0, 1)), vertices_m=vertices)
-        traced = TracedObject(mesh, vertices)
-        hits = traced.primary(PixelRays.of(RIG.camera))
-        assert hits.pixels.size == X.size
-        assert mixed_pixels(traced, hits, RIG, 3).pixels.size == 0
+        hits, found = mixed(mesh, across=3)
+        assert hits.pixels.size == X.size and found.pixels.size == 0
 
 
 def test_a_step_mixes_from_two_millimetres_on():
     for step_mm, found_px in ((1.9, 0), (2.1, 100)):
-        near, far = (
-            plate(40.49, 90.2, 30.51, 130.49, 1.8),
-            plate(80.0, 140.49, 30.51, 130.49, 1.8 + step_mm / 1000),
-        )
-        _, found = mixed(near, far, across=4)
+        near = plate(40.49, 90.2, 30.51, 130.49, 1.8)
+        far = plate(80.0, 140.49, 30.51, 130.49, 1.8 + step_mm / 1000)
+        _, found = mixed(sheet(near, far))
         assert found.void.sum() == found_px
         assert (found.pixels % 176 == 90).all() and (found.triangle >= 0).all()
 
 
 def test_an_edge_mixes_light_but_not_depth():
     """Two sides of a ridge meet at an angle: pixels across the edge see both, and it is no void."""
-    mesh = solid(
-        trimesh.creation.box(
-            (0.2, 0.2, 0.2), trimesh.transformations.rotation_matrix(np.pi / 4, [0, 1, 0])
-        )
-    )
-    vertices = np.add(mesh.vertices_m, [0.0011, 0.0, 1.8])
-    traced = TracedObject(mesh, vertices)
-    hits = traced.primary(PixelRays.of(RIG.camera))
-    found = mixed_pixels(traced, hits, RIG, 4)
+    turn = trimesh.transformations.rotation_matrix(np.pi / 4, [0, 1, 0])
+    _, found = mixed(solid(trimesh.creation.box((0.2, 0.2, 0.2), turn)), (0.0011, 0.0, 1.8))
     middle = found.pixels[np.abs(X.ravel()[found.pixels]) < 0.01]
     ridge = ~found.void[np.isin(found.pixels, middle)]
     assert ridge.sum() > 40
     # Of these pixels' rays some see the left side, some the right, and all are on the object.
     of = np.isin(found.pixels, middle[ridge])
     normals = found.normals.reshape(-1, 16, 3)[of]
-    assert (normals[:, :, 0].min(axis=1) < -0.7).all() and (
-        normals[:, :, 0].max(axis=1) > 0.7
-    ).all()
+    across = normals[:, :, 0]
+    assert (across.min(axis=1) < -0.7).all() and (across.max(axis=1) > 0.7).all()
     assert (found.share[of] == 1).all()
 
 
 def test_all_of_nothing_and_nothing_of_all():
-    hits, found = mixed(plate(300, 400))  # beside the image
+    hits, found = mixed(sheet(plate(300, 400)))  # beside the image
     assert hits.pixels.size == 0 and found.pixels.size == 0 and found.points_m.shape == (0, 3)
-    hits, found = mixed(plate(-10, 200, -10, 200))
+    hits, found = mixed(sheet(plate(-10, 200, -10, 200)))
     assert hits.pixels.size == X.size and found.pixels.size == 0
 
 
 def test_a_lens_with_distortion_keeps_rays_in_their_pixel():
     bent = replace(RIG, camera=replace(RIG.camera, distortion=(-0.2, 0.05, 0.001, -0.001, 0.0)))
-    mesh = solid(trimesh.creation.icosphere(4, 0.15))
-    traced = TracedObject(mesh, np.add(mesh.vertices_m, [0.1, 0.05, 1.8]))
-    hits = traced.primary(PixelRays.of(bent.camera))
-    found = mixed_pixels(traced, hits, bent, 3)
+    ball = solid(trimesh.creation.icosphere(4, 0.15))
+    _, found = mixed(ball, (0.1, 0.05, 1.8), 3, bent)
     u, v = bent.camera.project(found.points_m)
     row, column = np.divmod(np.repeat(found.pixels, 9), 176)
     assert found.void.all() and found.pixels.size > 100

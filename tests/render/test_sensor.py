@@ -18,7 +18,6 @@ from scipy import stats
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.light import CameraLight, named_light
 from fpp_ml_bench.loaders.render.projector import ALONG_U, PatternPlace
-from fpp_ml_bench.loaders.render.scene import uniform
 from fpp_ml_bench.loaders.render.sensor import (
     Exposure,
     Noise,
@@ -52,10 +51,8 @@ def frames():
 @pytest.mark.parametrize("name", STREAMS)
 def test_distribution_is_normal(frames, name):
     z = frames[name]
-    assert stats.kstest(z, "norm").pvalue > 1e-3
-    assert stats.cramervonmises(z[:200_000], "norm").pvalue > 1e-3
-    # Anderson-Darling weighs the tails; with known mean and variance its 0.1% point is 6.0
-    # (Stephens 1974).
+    # Anderson-Darling, which weighs the tails too; with known mean and variance its 0.1% point is
+    # 6.0 (Stephens 1974).
     u = np.sort(stats.norm.cdf(z))
     i = np.arange(1, u.size + 1)
     a2 = -u.size - np.mean((2 * i - 1) * (np.log(u) + np.log1p(-u[::-1])))
@@ -116,12 +113,6 @@ def test_hash_is_a_bijection_of_the_pixel_number():
     assert np.unique(hashes).size == sample.size
 
 
-def test_uniform_is_uniform():
-    draws = np.array([uniform(42, "mug", i) for i in range(5000)])
-    assert stats.kstest(draws, "uniform").pvalue > 1e-3
-    assert draws.min() >= 0 and draws.max() < 1
-
-
 # ---- the sensor as EMVA 1288 measures it, from the bytes of frames of a flat field
 
 
@@ -130,6 +121,12 @@ def flat(grey, n=PIXELS.size):
     nothing = np.zeros(n, dtype=np.uint16), np.zeros(n, dtype=np.float32)
     place = PatternPlace(*nothing, *nothing, np.empty(0, np.uint8), np.empty(0, np.float32))
     return LitPixels(place, np.full(n, grey, dtype=np.float32), np.zeros(n, dtype=np.float32))
+
+
+def lit_by(grey, ambient, bounced):
+    """Three pixels with light of the pattern, of other lamps and of bounces."""
+    bounces = np.full((52, 3), bounced, np.float32)
+    return replace(flat(grey, 3), ambient=np.full(3, ambient, np.float32), bounced=bounces)
 
 
 def exposure_of(rig=None, projector=None, **camera):
@@ -195,11 +192,7 @@ def test_converter_and_response_against_a_direct_evaluation(bits, response):
     black_grey, most = 4.25, 2**bits - 1
     light = RAMP.astype(np.float64) + black_grey
     code = np.floor(light / 255 * most + 0.5).clip(0, most) / most
-    curve = (
-        code**response
-        if not isinstance(response, tuple)
-        else np.interp(code, [0, 1 / 3, 2 / 3, 1], response)
-    )
+    curve = np.interp(code, [0, 1 / 3, 2 / 3, 1], response) if np.ndim(response) else code**response
     read = ramp_bytes(bits=bits, response=response, black_grey=black_grey)
     assert read.dtype == np.uint8
     off = read != np.floor(255 * curve + 0.5)
@@ -222,15 +215,11 @@ def test_bounces_take_no_light_away(bits):
     then the square root of the noise is none, and a code that is not a number would be looked up
     beside its table."""
     exposure = exposure_of(bits=bits, full_well_e=23000.0, read_noise_e=12.0, black_grey=9.0)
-    dark, taken = (
-        flat(0.0),
-        replace(flat(0.0), bounced=np.full((52, PIXELS.size), -13.0, np.float32)),
-    )
+    dark = flat(0.0)
+    taken = replace(dark, bounced=np.full((52, PIXELS.size), -13.0, np.float32))
     frames = [exposure.expose([WHITE], lit, PIXELS, (1, "flat"))[0] for lit in (dark, taken)]
     assert (frames[0] == frames[1]).all() and frames[0].mean() == pytest.approx(9, abs=0.1)
-    lit = replace(
-        flat(0.0, 3), ambient=np.full(3, 20, np.float32), bounced=np.full((52, 3), -13, np.float32)
-    )
+    lit = lit_by(0.0, 20, -13)
     assert (exposure.radiance([WHITE], lit, (1, "flat"), np.empty((1, 3), np.float32)) == 7).all()
 
 
@@ -240,13 +229,8 @@ def test_bounces_take_no_light_away(bits):
 def test_flicker_is_one_factor_a_frame_and_normal():
     exposure = exposure_of(projector={"flicker": 0.02})
     assert exposure_of().flicker == 0
-    lamps = []
+    lamps, lit = [], lit_by(2e3, 7.0, 1e3)
     for view in range(40):
-        lit = replace(
-            flat(2e3, 3),
-            ambient=np.full(3, 7.0, dtype=np.float32),
-            bounced=np.full((52, 3), 1e3, np.float32),
-        )
         light = exposure.radiance(range(52), lit, (1, "flat", view), np.empty((52, 3), np.float32))
         assert (light == light[:, :1]).all()  # the same for every pixel
         # Direct and bounced light flicker together, other lamps don't.

@@ -1,6 +1,5 @@
 """The track of rigs: what its rigs are, building it, predicting and scoring all of it."""
 
-import json
 import math
 from collections import Counter
 from dataclasses import replace
@@ -9,8 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import fpp_bench, fpp_eval, printed, read_json, refusal
 
-from fpp_ml_bench.cli import main, main_eval
 from fpp_ml_bench.design.rigs import broken_rule
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.parts import TrackScores
@@ -52,7 +51,7 @@ SHRUNK = 2
 """Times that the images of the small track are smaller."""
 
 
-def test_the_rigs_are_sixteen_that_a_lab_could_own() -> None:
+def test_the_rigs_are_sixteen_that_a_lab_could_own():
     settings = track()
     assert len(settings) == 16 * len(TRACK_LIGHTS)
     assert list(settings) == list(TRACK.content)
@@ -76,10 +75,10 @@ def test_the_rigs_are_sixteen_that_a_lab_could_own() -> None:
         assert len(entry.objects) == 6 and len(entry.rig.crossed) == 3
 
 
-def test_the_preset_takes_no_settings_of_another(tmp_path, capsys) -> None:
-    for words in (("--size", "96"), ("--light", "hard"), ("--objects", "gear"), ("--seed", "1")):
-        assert main(["build", "--out", str(tmp_path / "no"), "--preset", "rigs", *words]) == 2
-        assert f"{words[0]}: the preset rigs has" in capsys.readouterr().err
+def test_the_preset_takes_no_settings_of_another(tmp_path):
+    for words in ("--size 96", "--light hard", "--objects gear", "--seed 1"):
+        said = refusal(fpp_bench, f"build --out {tmp_path}/no --preset rigs", words)
+        assert f"{words.split()[0]}: the preset rigs has" in said
     assert not (tmp_path / "no").exists()
 
 
@@ -106,7 +105,7 @@ def _predict(small, below, error_mm: float) -> None:
         (folder / "submission.yaml").write_text(SUBMISSION)
 
 
-def test_a_track_is_scored_in_units_that_compare_between_rigs(small, tmp_path) -> None:
+def test_a_track_is_scored_in_units_that_compare_between_rigs(small, tmp_path):
     _predict(small, tmp_path / "mine", 2.0)
     scores = score_track(tmp_path / "mine", datasets_below(small))
     assert scores.benchmark is None and scores.title == "no named track"
@@ -131,7 +130,7 @@ def test_a_track_is_scored_in_units_that_compare_between_rigs(small, tmp_path) -
     assert scores.worst("paper") == "rig-02-paper"
 
 
-def test_a_refused_rig_has_its_reason_and_no_score(small, tmp_path) -> None:
+def test_a_refused_rig_has_its_reason_and_no_score(small, tmp_path):
     below = tmp_path / "mine"
     _predict(small, below, 2.0)
     for file in (below / "rig-02-paper").iterdir():
@@ -144,20 +143,18 @@ def test_a_refused_rig_has_its_reason_and_no_score(small, tmp_path) -> None:
     assert scores.lights == ["workshop"] and list(scores.datasets) == ["rig-14-workshop"]
 
 
-def test_from_prediction_to_table_and_row(small, tmp_path, capsys) -> None:
+def test_from_prediction_to_table_and_row(small, tmp_path):
     below, table, result = (tmp_path / name for name in ("crossed", "rigs.json", "result.json"))
-    for said in ("1 frame", "complete already"):
-        assert main(["predict", "crossed", str(small), "--out", str(below)]) == 0
-        assert said in capsys.readouterr().out
-    assert main(["predict", "crossed", str(small), "--frames", "3", "--out", str(below)]) == 2
-    assert "rig-02-paper" in capsys.readouterr().err
-    one = str(below / "rig-02-paper"), str(small / "rig-02-paper")
-    assert main_eval([*one, "--target", "depth_exact", "--json", str(result)]) == 0
-    words = [str(below), str(small), "--json", str(table), "--into", str(result)]
-    assert main_eval(words) == 0
-    assert "worst, workshop: rig-14-workshop" in capsys.readouterr().out
-    scores = json.loads(table.read_text())
-    assert scores == json.loads(result.read_text())["rigs"]
+    predict = f"predict crossed {small} --out {below}"
+    assert "1 frame" in printed(fpp_bench, predict)
+    assert "complete already" in printed(fpp_bench, predict)
+    assert "rig-02-paper" in refusal(fpp_bench, predict, "--frames 3")
+    one = f"{below}/rig-02-paper {small}/rig-02-paper"
+    assert fpp_eval(one, f"--target depth_exact --json {result}") == 0
+    said = printed(fpp_eval, f"{below} {small} --json {table} --into {result}")
+    assert "worst, workshop: rig-14-workshop" in said
+    scores = read_json(table)
+    assert scores == read_json(result)["rigs"]
     assert scores["method"] == "crossed" and not scores["refused"]
     brief = in_brief(TrackScores.model_validate(scores))
     assert brief["per_mille"].keys() == scores["datasets"].keys()
@@ -167,29 +164,26 @@ def test_from_prediction_to_table_and_row(small, tmp_path, capsys) -> None:
     assert shown == f"{brief['per_mille']['rig-02-paper']:.1f} (1 refused)"
     assert rigs(SimpleNamespace(row=SimpleNamespace(rigs=None), all_checked=True)) == "-"
     assert brief["mean"]["paper"]["per_mille"] == brief["worst_per_mille"]["paper"]
-    assert main_eval([*one, "--into", str(result)]) == 2
-    assert main_eval([str(below), str(small), "--report", str(tmp_path / "page")]) == 2
-    assert "is of one dataset" in capsys.readouterr().err
+    assert fpp_eval(one, "--into", result) == 2
+    assert "is of one dataset" in refusal(fpp_eval, f"{below} {small} --report {tmp_path}/page")
 
 
-def test_a_method_that_cannot_be_for_a_rig_says_so(small, tmp_path, capsys) -> None:
+def test_a_method_that_cannot_be_for_a_rig_says_so(small, tmp_path):
     below, method = tmp_path / "near", tmp_path / "near.py"
     method.write_text(NEAR)
-    assert main(["predict", f"{method}:Near", str(small), "--out", str(below)]) == 0
-    assert "rig-14-workshop: refused: near: sees no farther" in capsys.readouterr().out
+    said = printed(fpp_bench, f"predict {method}:Near {small} --out {below}")
+    assert "rig-14-workshop: refused: near: sees no farther" in said
     assert (below / "rig-14-workshop" / REFUSED_FILE).is_file()
-    assert main_eval([str(below), str(small)]) == 0
-    assert "rig-14-workshop: refused. near: sees" in capsys.readouterr().out
+    assert "rig-14-workshop: refused. near: sees" in printed(fpp_eval, below, small)
     rmtree(below / "rig-02-paper")
     (below / "rig-02-paper").mkdir()
     (below / "rig-02-paper" / REFUSED_FILE).write_text("not in the mood")
-    assert main_eval([str(below), str(small)]) == 2
-    assert "refused every rig" in capsys.readouterr().err
-    assert main(["predict", "no-such-method", str(small), "--out", str(tmp_path / "none")]) == 2
+    assert "refused every rig" in refusal(fpp_eval, below, small)
+    assert fpp_bench(f"predict no-such-method {small} --out {tmp_path}/none") == 2
     assert not (tmp_path / "none").exists()
 
 
-def test_a_dataset_of_the_track_with_other_content_is_warned_of(small, monkeypatch) -> None:
+def test_a_dataset_of_the_track_with_other_content_is_warned_of(small, monkeypatch):
     manifest = DatasetFolder(small / "rig-02-paper").manifest
     assert benchmark_sentence(manifest)[0]
     given = track()["rig-02-paper"]

@@ -5,9 +5,8 @@ from dataclasses import replace
 from itertools import product
 
 import pytest
-from conftest import tiny_settings
+from conftest import fpp_bench, printed, tiny_settings
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.loaders.render.builder import assembly_of, build
 from fpp_ml_bench.loaders.render.light import named_light
@@ -141,10 +140,9 @@ def test_settings_of_ones_own_are_no_benchmark():
 
 
 def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
-    settings = tiny_settings(objects=("cork",))
-    manifest = build(tmp_path / "data", settings, workers=1)
-    assert main(["verify", str(tmp_path / "data")]) == 0
-    assert "benchmark: a dataset of its own" in capsys.readouterr().out
+    settings, folder = tiny_settings(objects=("cork",)), tmp_path / "data"
+    manifest = build(folder, settings, workers=1)
+    assert "benchmark: a dataset of its own" in printed(fpp_bench, "verify", folder)
     known = replace(BENCHMARKS[0], name="fpp-bench-tiny")
     monkeypatch.setattr(module, "BENCHMARKS", (known,))
     monkeypatch.setattr(module, "FACTS", tmp_path)
@@ -155,18 +153,10 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
         "fpp_ml_bench.loaders.render.scene.preset_settings",
         lambda preset, size, light, rig: settings,
     )
-    assert main(["verify", str(tmp_path / "data")]) == 0
-    assert "benchmark: this is fpp-bench-tiny version 2" in capsys.readouterr().out
-    assert main(["info", str(tmp_path / "data"), "--json", "-"]) == 0
-    assert json.loads(capsys.readouterr().out)["benchmark"] == {
-        "name": "fpp-bench-tiny",
-        "version": 2,
-    }
+    assert "benchmark: this is fpp-bench-tiny version 2" in printed(fpp_bench, "verify", folder)
+    content = json.loads(printed(fpp_bench, "info", folder, "--json -"))
+    assert content["benchmark"] == {"name": "fpp-bench-tiny", "version": 2}
     monkeypatch.setattr(module, "BENCHMARKS", (replace(known, name="fpp-bench-other"),))
-    assert main(["verify", str(tmp_path / "data")]) == 0
-    output = capsys.readouterr()
-    assert (
-        "warning: built with the settings of fpp-bench-other version 2, but not its content"
-        in output.err
-    )
-    assert "benchmark" not in output.out
+    assert "benchmark" not in printed(fpp_bench, "verify", folder)
+    said = "warning: built with the settings of fpp-bench-other version 2, but not its content"
+    assert said in capsys.readouterr().err

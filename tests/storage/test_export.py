@@ -6,17 +6,23 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import datasets
 import numpy as np
 import pytest
 import scipy.io
 import trimesh
-from conftest import TINY_CONFIGS, TINY_OBJECTS, file_bytes
-from published_trees import command, imported, write_png
+from conftest import (
+    TINY_CONFIGS,
+    TINY_OBJECTS,
+    file_bytes,
+    fpp_bench,
+    printed,
+    read_image,
+    refusal,
+)
+from published_trees import imported, write_png
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError, PredictionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import whole_folder
@@ -61,8 +67,8 @@ def test_the_tree_comes_back_bit_by_bit_with_the_same_split(opened, returned):
     assert returned.splits == opened.splits and returned.configs == TINY_CONFIGS
     for sample in opened.samples("all"):
         assert returned.depth_mm(sample).tobytes() == opened.depth_mm(sample).tobytes()
-        for index in range(52):
-            assert np.array_equal(returned.frame(sample, index), opened.frame(sample, index))
+        frames = opened.frames(sample, range(52))
+        np.testing.assert_array_equal(returned.frames(sample, range(52)), frames)
     assert returned.manifest.settings["frame_order"] == "paper"
 
 
@@ -95,12 +101,9 @@ def test_files_and_variables_are_those_of_the_published_layout(opened, tree):
     for variant, (variable, values) in expected.items():
         for removed, image in (("", frame), ("bgremoved_", np.where(depth > 0, frame, 0))):
             folder = tree / TRAINING / f"training_data_{removed}depth_{variant}" / "test"
-            np.testing.assert_allclose(
-                scipy.io.loadmat(folder / f"depth/{SAMPLE}.mat")[variable], values, rtol=1e-12
-            )
-            assert np.array_equal(
-                cv2.imread(str(folder / f"fringe/{SAMPLE}.png"), cv2.IMREAD_UNCHANGED), image
-            )
+            stored = scipy.io.loadmat(folder / f"depth/{SAMPLE}.mat")[variable]
+            np.testing.assert_allclose(stored, values, rtol=1e-12)
+            assert np.array_equal(read_image(folder / f"fringe/{SAMPLE}.png"), image)
     info = scipy.io.loadmat(tree / TRAINING / f"info_depth_params/test/depth/{SAMPLE}.mat")
     assert (info["depth_min"], info["depth_max"]) == ([[low]], [[high]])
 
@@ -109,8 +112,7 @@ def test_raw_scans_hold_52_frames_and_phases_that_belong_together(opened, tree):
     folder = tree / SCANS / "power_drill" / "A60"
     assert len(list(folder.iterdir())) == 54
     for index in range(52):
-        image = cv2.imread(str(folder / f"A_{index}.png"), cv2.IMREAD_UNCHANGED)
-        assert np.array_equal(image, opened.frame(SAMPLE, index))
+        assert np.array_equal(read_image(folder / f"A_{index}.png"), opened.frame(SAMPLE, index))
     wrapped = scipy.io.loadmat(folder / "wrapped_phase.mat")["wph"]
     unwrapped = scipy.io.loadmat(folder / "unwrapped_phase.mat")["uph"]
     decoded = np.isfinite(unwrapped)
@@ -127,9 +129,8 @@ def test_raw_scans_hold_52_frames_and_phases_that_belong_together(opened, tree):
         np.tensordot(np.sin(shifts), stack, 1), np.tensordot(np.cos(shifts), stack, 1)
     )
     difference = np.angle(np.exp(1j * (wrapped - expected)))[decoded]
-    assert (
-        np.abs(difference).max() < 2**-23 * np.pi
-    )  # float64 rounded once to float32, with a factor 2 to spare
+    # float64 rounded once to float32, with a factor 2 to spare.
+    assert np.abs(difference).max() < 2**-23 * np.pi
 
 
 def test_two_exports_are_equal_byte_by_byte_whatever_the_threads(opened, tmp_path):
@@ -207,8 +208,9 @@ def test_another_frame_order_is_detected_undone_and_reported(opened, test_tree, 
         shutil.copy(tree / SCANS / name / view / "A_0.png", path)
     dataset = imported(tree, tmp_path / "out")
     assert dataset.manifest.settings["frame_order"] == order.name
-    for index in range(52):
-        assert np.array_equal(dataset.frame(SAMPLE, index), opened.frame(SAMPLE, index))
+    np.testing.assert_array_equal(
+        dataset.frames(SAMPLE, range(52)), opened.frames(SAMPLE, range(52))
+    )
     assert any(
         "is a vertical fringe, stored in column frame_18" in note
         for note in import_notes(dataset.manifest)
@@ -283,9 +285,9 @@ def test_an_imported_dataset_exports_too(returned, tmp_path):
     assert not (tmp_path / "meshes").exists()
 
 
-def test_several_forms_each_get_a_folder(opened, tiny, tmp_path, capsys):
-    assert command("export", tiny, "--out", tmp_path / "out", "--meshes", "--patterns") == 0
-    assert "meshes, patterns of 24 samples" in capsys.readouterr().out
+def test_several_forms_each_get_a_folder(tiny, tmp_path):
+    said = printed(fpp_bench, f"export {tiny} --out {tmp_path}/out --meshes --patterns")
+    assert "meshes, patterns of 24 samples" in said
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"meshes", "patterns"}
     assert {path.stem for path in (tmp_path / "out/meshes").iterdir()} == set(TINY_OBJECTS)
     assert trimesh.load(tmp_path / "out/meshes/mug.ply").is_watertight
@@ -294,7 +296,7 @@ def test_several_forms_each_get_a_folder(opened, tiny, tmp_path, capsys):
 
 def test_one_form_and_one_split_go_straight_into_the_folder(tiny, tmp_path):
     (tmp_path / "out").mkdir()
-    assert command("export", tiny, "--out", tmp_path / "out", "--meshes", "--split", "test") == 0
+    assert fpp_bench(f"export {tiny} --out {tmp_path}/out --meshes --split test") == 0
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["power_drill.ply"]
 
 
@@ -336,21 +338,18 @@ def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp
 @pytest.mark.parametrize(
     "words",
     [
-        ("{data}", "--out", "out"),
-        ("nowhere", "--out", "out", "--mat"),
-        ("{data}", "--out", "file", "--mat"),
-        ("{data}", "--out", "{data}", "--parquet"),
-        ("{data}", "--out", "out", "--parquet", "--split", "val"),
+        "DATA --out out",
+        "nowhere --out out --mat",
+        "DATA --out file --mat",
+        "DATA --out DATA --parquet",
+        "DATA --out out --parquet --split val",
     ],
 )
-def test_bad_input_to_the_command_is_a_message_and_status_2(
-    tiny, tmp_path, monkeypatch, capsys, words
-):
+def test_bad_input_to_the_command_is_a_message_and_status_2(tiny, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
-    assert command("export", *(word.format(data=tiny) for word in words)) == 2
-    message = capsys.readouterr().err
-    assert "error:" in message and "Traceback" not in message and not Path("out").exists()
+    assert "error:" in refusal(fpp_bench, "export", words.replace("DATA", str(tiny)))
+    assert not Path("out").exists()
 
 
 READ_ROWS = """
@@ -376,30 +375,27 @@ def test_croissant_metadata_is_valid_and_reads_the_rows(tmp_path):
         assert all(np.array_equal(read[name], dataset.depth_mm(name)) for name in read)
 
 
-def test_depth_maps_are_read_back_by_opencv_and_scored(opened, tmp_path, capsys):
-    dataset = opened
-    predictions = write_predictions(tmp_path / "predictions", dataset, "test", offset_mm=3.0)
-    words = [str(dataset.path), "--split", "test", "--maps"]
-    assert main(["export", *words, "pfm,png,ply", "--out", str(tmp_path / "truth")]) == 0
+def test_depth_maps_are_read_back_by_opencv_and_scored(opened, tmp_path):
+    predictions = write_predictions(tmp_path / "predictions", opened, "test", offset_mm=3.0)
+    export_maps = f"export {opened.path} --split test --maps"
+    assert fpp_bench(f"{export_maps} pfm,png,ply --out {tmp_path}/truth") == 0
     unit_mm = float((tmp_path / "truth" / "png_scale.txt").read_text().split()[0])
-    for sample in dataset.samples("test"):
-        truth = cv2.imread(str(tmp_path / "truth" / f"{sample}.pfm"), cv2.IMREAD_UNCHANGED)
-        levels = cv2.imread(str(tmp_path / "truth" / f"{sample}.png"), cv2.IMREAD_UNCHANGED)
-        assert np.array_equal(truth, dataset.depth_mm(sample)) and levels.dtype == np.uint16
+    for sample in opened.samples("test"):
+        truth = read_image(tmp_path / "truth" / f"{sample}.pfm")
+        levels = read_image(tmp_path / "truth" / f"{sample}.png")
+        assert np.array_equal(truth, opened.depth_mm(sample)) and levels.dtype == np.uint16
         assert np.abs(levels * unit_mm - truth).max() <= unit_mm / 2 * 1.001
         cloud = trimesh.load(tmp_path / "truth" / f"{sample}.ply")
         assert len(cloud.vertices) == np.count_nonzero(truth)
     again = tmp_path / "again"
-    made = ["pfm", "--predictions", str(predictions), "--out", str(again)]
-    assert main(["export", *words, *made]) == 0
+    made = f"--predictions {predictions} --out {again}"
+    assert fpp_bench(export_maps, "pfm", made) == 0
     shutil.copyfile(predictions / "submission.yaml", again / "submission.yaml")
-    scores = [evaluate(folder, dataset, "test").metrics for folder in (predictions, again)]
+    scores = [evaluate(folder, opened, "test").metrics for folder in (predictions, again)]
     assert scores[0].object_mae_mm == pytest.approx(scores[1].object_mae_mm, rel=1e-6) != 0
-    (again / f"{dataset.samples('test')[0]}.pfm").write_bytes(b"Pf\n176 176\n-1.0\n1234")
+    (again / f"{opened.samples('test')[0]}.pfm").write_bytes(b"Pf\n176 176\n-1.0\n1234")
     with pytest.raises(PredictionError, match="holds 4 bytes of values, expected 123904"):
-        evaluate(again, dataset, "test")
-    capsys.readouterr()
-    assert main(["export", *words, "exr", "--out", str(tmp_path / "none")]) == 2
-    assert "expected some of pfm, png, ply" in capsys.readouterr().err
-    assert main(["export", str(dataset.path), *made[1:]]) == 2
-    assert "--predictions: needs --maps" in capsys.readouterr().err
+        evaluate(again, opened, "test")
+    said = refusal(fpp_bench, f"{export_maps} exr --out {tmp_path}/none")
+    assert "expected some of pfm, png, ply" in said
+    assert "--predictions: needs --maps" in refusal(fpp_bench, "export", opened.path, made)

@@ -128,43 +128,29 @@ def test_new_data_in_the_same_folder_is_not_read_out_of_the_old_cache(tmp_path):
     assert (frames[0] != frames[1]).any()
 
 
-def test_usual_operations(tiny, opened, tmp_path):
-    folder = tmp_path / "copy"  # `filter` leaves its cache beside the data
-    shutil.copytree(tiny, folder)
-    dataset = load_dataset(folder, "vertical", split="train")
-    shuffled = dataset.shuffle(seed=3)
-    assert (
-        sorted(shuffled["sample"]) == sorted(opened.splits["train"])
-        and shuffled["sample"][:] != dataset["sample"][:]
-    )
-    selected = shuffled.select([4, 0])
+def test_usual_operations(copied, opened):
+    dataset = load_dataset(copied, "vertical", split="train")
+    selected = dataset.shuffle(seed=3).select([4, 0])
     for row in selected.with_format("numpy"):
         np.testing.assert_array_equal(row["frame_20"], opened.frame(row["sample"], 20))
     filtered = dataset.filter(lambda view: view == "A60", input_columns="view")
     assert filtered["sample"][:] == ["bowl_A60", "cork_A60"]
     row = dataset.with_format("torch", columns=["frame_18", "depth"], dtype=torch.float32)[0]
-    assert row["frame_18"].dtype == torch.float32 and row["frame_18"].shape == (
-        TINY_SIZE,
-        TINY_SIZE,
-    )
-    again = pickle.loads(pickle.dumps(dataset))
-    np.testing.assert_array_equal(
-        again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"])
-    )
-    assert verify(folder) == []  # verify ignores those caches
+    assert row["frame_18"].dtype == torch.float32
+    assert row["frame_18"].shape == (TINY_SIZE, TINY_SIZE)
+    again = pickle.loads(pickle.dumps(dataset)).with_format("numpy")[7]
+    np.testing.assert_array_equal(again["depth"], opened.depth_mm(again["sample"]))
+    assert verify(copied) == []  # `filter` leaves its cache beside the data, which is ignored
 
 
-def test_fingerprints_follow_the_data(tiny, tmp_path):
-    shutil.copytree(tiny, tmp_path / "moved")
-    fingerprint = load_dataset(tiny, "single_shot", split="train")._fingerprint
-    assert (
-        load_dataset(tmp_path / "moved", "single_shot", split="train")._fingerprint == fingerprint
-    )
-    other_fingerprints = {
-        load_dataset(tiny, c, split=s)._fingerprint
-        for c, s in (("all", "train"), ("single_shot", "test"))
-    }
-    assert len(other_fingerprints | {fingerprint}) == 3
+def test_fingerprints_follow_the_data(tiny, copied):
+    def fingerprint(folder, config, split):
+        return load_dataset(folder, config, split=split)._fingerprint
+
+    first = fingerprint(tiny, "single_shot", "train")
+    assert fingerprint(copied, "single_shot", "train") == first
+    others = {fingerprint(tiny, "all", "train"), fingerprint(tiny, "single_shot", "test")}
+    assert len(others | {first}) == 3
 
 
 @pytest.mark.parametrize(("config", "exact"), [("single_shot", False), ("all", True)])
@@ -181,14 +167,11 @@ def test_schema_is_what_datasets_itself_would_write(config, exact):
         expected_features[name] = datasets.Array2D((120, 160), "float32")
     # Through a file, as a reader gets it: with `datasets` imported, the extension type comes from
     # the metadata.
-    schema, expected = (
-        pa.ipc.read_schema(arrow_schema(features(columns, (120, 160))).serialize()),
-        expected_features.arrow_schema,
-    )
+    written = arrow_schema(features(columns, (120, 160))).serialize()
+    schema, expected = pa.ipc.read_schema(written), expected_features.arrow_schema
     assert schema.equals(expected)
-    assert json.loads(schema.metadata[b"huggingface"]) == json.loads(
-        expected.metadata[b"huggingface"]
-    )
+    stated, wanted = (json.loads(one.metadata[b"huggingface"]) for one in (schema, expected))
+    assert stated == wanted
     assert datasets.Features.from_arrow_schema(schema) == expected_features
     assert datasets.Features.from_dict(features(columns, (120, 160))) == expected_features
 

@@ -11,13 +11,22 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import yaml
-from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
+from conftest import (
+    TINY_OBJECTS,
+    TINY_SIZE,
+    file_bytes,
+    flip,
+    fpp_bench,
+    printed,
+    refusal,
+    tiny_settings,
+)
 from disks import small_disk
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, PoolError
 from fpp_ml_bench.loaders.render.builder import assembly_of, build
 from fpp_ml_bench.loaders.render.light import named_light
@@ -33,34 +42,20 @@ DIRECT = named_light("paper").changed("bounces", interreflection=False, ambient_
 SMALL = {"objects": ("cork",), "stored": "single_shot"}
 
 
-def build_arguments(folder, *more, objects=TINY_OBJECTS, workers=1):
-    size, objects, workers = str(TINY_SIZE), ",".join(objects), str(workers)
-    return [
-        "build",
-        "--out",
-        str(folder),
-        "--size",
-        size,
-        "--objects",
-        objects,
-        "--workers",
-        workers,
-        *more,
-    ]
+def build_line(folder, objects=TINY_OBJECTS, workers=1):
+    words = f"--out {folder} --size {TINY_SIZE} --workers {workers}"
+    return f"build {words} --objects {','.join(objects)}"
 
 
-def half_arguments(folder, light):
+def half_line(folder, light):
     """Of the dataset of `half_settings`."""
-    return build_arguments(
-        folder, "--config", "single_shot", "--light", light, objects=("cork", "mug")
-    )
+    return f"{build_line(folder, ('cork', 'mug'))} --config single_shot --light {light}"
 
 
-def start(arguments):
+def start(line):
     """A build in a separate process and process group."""
     return subprocess.Popen(
-        [*COMMAND, *arguments],
-        cwd=ROOT,
+        [*COMMAND, *line.split()],
         start_new_session=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -122,7 +117,7 @@ def direct_light(tmp_path):
     """`DIRECT` as a file for the command."""
     file = tmp_path / "direct.yaml"
     file.write_text(yaml.safe_dump(DIRECT.model_dump(mode="json")))
-    return str(file)
+    return file
 
 
 @pytest.fixture
@@ -147,7 +142,7 @@ def uninterrupted(tmp_path_factory):
 
 
 @pytest.mark.processes
-def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, capsys):
+def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path):
     folder = tmp_path / "killed"
     work = folder / ".build"
 
@@ -167,13 +162,13 @@ def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, ca
     ]
     reached = 0
     for workers, moment in moments:
-        process = start(build_arguments(folder, workers=workers))
+        process = start(build_line(folder, workers=workers))
         if wait_for(moment, process):
             reached += 1
             if reached == 1:
                 # While it runs, a second build into the folder is refused.
-                assert main(build_arguments(folder)) == 2
-                assert "another process is writing" in capsys.readouterr().err
+                said = refusal(fpp_bench, build_line(folder))
+                assert "another process is writing" in said
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         process.stderr.close()
@@ -209,26 +204,27 @@ def test_resume_makes_only_what_is_missing(half_built, uninterrupted, monkeypatc
     assert file_bytes(half_built) == uninterrupted
 
 
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+RECEIPT = ".build/train-00000-of-00001.json"
+
+
 @pytest.mark.parametrize(
-    "damage", ["flip", "cut", "remove", "mesh", "receipt", "receipt of nothing"]
+    ("name", "damage"),
+    [
+        ("train/*.arrow", flip),
+        ("train/*.arrow", cut),
+        ("train/*.arrow", Path.unlink),
+        ("meshes/cork.ply", Path.unlink),
+        (RECEIPT, cut),
+        (RECEIPT, lambda path: path.write_text('{"files": [], "rows": []}')),
+    ],
 )
-def test_resume_trusts_no_damaged_work(half_built, uninterrupted, damage):
-    (shard,) = final_shards(half_built)
-    receipt = half_built / ".build" / "train-00000-of-00001.json"
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    if damage == "flip":
-        shard.write_bytes(content)
-    elif damage == "cut":
-        shard.write_bytes(content[:-100])
-    elif damage == "remove":
-        shard.unlink()
-    elif damage == "mesh":
-        (half_built / "meshes" / "cork.ply").unlink()
-    elif damage == "receipt":
-        receipt.write_text(receipt.read_text()[:100])
-    else:
-        receipt.write_text('{"files": [], "rows": []}')
+def test_resume_trusts_no_damaged_work(half_built, uninterrupted, name, damage):
+    (path,) = half_built.glob(name)
+    damage(path)
     build(half_built, half_settings(), workers=1)
     assert file_bytes(half_built) == uninterrupted
 
@@ -276,48 +272,36 @@ def test_half_a_dataset_of_another_version_is_not_finished(half_built, monkeypat
         build(half_built, half_settings(), workers=1)
 
 
-def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, direct_light, capsys):
+def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, direct_light):
     build(half_built, half_settings(), workers=1)
-    stamps = {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()}
-    arguments = half_arguments(half_built, direct_light)
-    assert main(arguments) == 0
-    assert "complete already" in capsys.readouterr().out
-    assert {
-        path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()
-    } == stamps
+
+    def stamps():
+        return {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()}
+
+    before, line = stamps(), half_line(half_built, direct_light)
+    assert "complete already" in printed(fpp_bench, line)
+    assert stamps() == before
     final_shards(half_built)[0].unlink()
-    assert main(arguments) == 2
-    assert "missing" in capsys.readouterr().err
+    assert "missing" in refusal(fpp_bench, line)
 
 
-@pytest.mark.parametrize(
-    "content", ["file", "folder with files", "dataset of others", "damaged settings"]
-)
-def test_folders_with_other_content(tmp_path, half_built, content, capsys):
+@pytest.mark.parametrize("name", ["", "thesis.tex", "manifest.json"])
+def test_folders_with_other_content(tmp_path, name):
+    """A file in the folder's place, files of others, a dataset of others."""
     folder = tmp_path / "out"
-    if content == "file":
-        folder.write_text("x")
-    elif content == "damaged settings":
-        folder = half_built
-        (folder / ".build" / "settings.json").write_text("{")
-    else:
+    if name:
         folder.mkdir()
-        (folder / ("manifest.json" if content == "dataset of others" else "thesis.tex")).write_text(
-            "{}"
-        )
+    (folder / name).write_text("{}")
     with pytest.raises(DatasetError, match=str(folder)):
         build(folder, half_settings(), workers=1)
-    if content == "folder with files":
-        assert [path.name for path in folder.iterdir()] == ["thesis.tex"]
+    assert (folder / name).read_text() == "{}"
 
 
 def test_lock_is_free_after_an_error(tmp_path, monkeypatch):
-    def fail(*_):
-        raise BuildError("no")
-
     with monkeypatch.context() as patched:
-        patched.setattr(Studio, "photograph", fail)
+        patched.setattr(Studio, "photograph", Mock(side_effect=BuildError("no")))
         with pytest.raises(BuildError, match="no"):
+            build(tmp_path / "set", tiny_settings(**SMALL), workers=1)
             build(tmp_path / "set", tiny_settings(**SMALL), workers=1)
     assert not list((tmp_path / "set").rglob("*.tmp"))
     build(tmp_path / "set", tiny_settings(**SMALL), workers=1)
@@ -350,13 +334,12 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
 @pytest.mark.processes
 def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted, direct_light):
     folder = tmp_path / "set"
-    process = start([*half_arguments(folder, direct_light), "--workers", "2"])
+    process = start(f"{half_line(folder, direct_light)} --workers 2")
     assert wait_for(lambda: list(folder.glob("*/.*.tmp")), process)
     os.killpg(process.pid, signal.SIGTERM)
     errors = process.communicate(timeout=60)[1]
-    assert process.returncode == 143 and errors.endswith(
-        "fpp-bench build: stopped; the same command continues\n"
-    )
+    assert process.returncode == 143
+    assert errors.endswith("fpp-bench build: stopped; the same command continues\n")
     assert "Traceback" not in errors and "resource_tracker" not in errors
     deadline = time.monotonic() + 30  # its helper process may outlive it by a moment
     while group_members(process.pid) and time.monotonic() < deadline:
@@ -369,10 +352,9 @@ def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted,
 # ---- full disks
 
 
-def test_full_disk_is_refused_beforehand(tmp_path, capsys):
+def test_full_disk_is_refused_beforehand(tmp_path):
     with small_disk(tmp_path / "disk", "1500k") as full_disk:
-        assert main(build_arguments(full_disk / "set", objects=("cork",))) == 2
-        message = capsys.readouterr().err
+        message = refusal(fpp_bench, build_line(full_disk / "set", ("cork",)))
         assert "GB free" in message and str(full_disk) in message
         assert not final_shards(full_disk)
 
@@ -382,7 +364,7 @@ def test_files_that_can_not_grow(tmp_path, direct_light, uninterrupted):
     """No space in the middle of a shard, through a limit on file sizes (EFBIG), which needs no
     privileges."""
     folder = tmp_path / "set"
-    arguments = [*COMMAND, *half_arguments(folder, direct_light)]
+    arguments = [*COMMAND, *half_line(folder, direct_light).split()]
     limit = 1_000_000  # bytes; a shard has 1.7 million
 
     def no_large_files():

@@ -3,10 +3,10 @@
 import json
 
 import pytest
+from conftest import fpp_bench, printed
 from synthetic import make
 
 from fpp_ml_bench import load_dataset
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -20,16 +20,13 @@ def unseen(tmp_path_factory):
     return make(tmp_path_factory.mktemp("unseen") / "dataset", {"test": OBJECTS})
 
 
-def test_it_is_intact_and_says_what_it_is(unseen, capsys):
+def test_it_is_intact_and_says_what_it_is(unseen):
     assert verify(unseen) == []
-    assert main(["info", str(unseen), "--json", "-"]) == 0
-    (split,) = json.loads(capsys.readouterr().out)["splits"]
+    (split,) = json.loads(printed(fpp_bench, "info", unseen, "--json -"))["splits"]
     assert (split["split"], split["objects"], split["samples"]) == ("test", 2, 12)
-    assert main(["info", str(unseen)]) == 0
-    assert (
-        'split="test"' in (unseen / "README.md").read_text()
-        and "train" not in (unseen / "README.md").read_text()
-    )
+    assert fpp_bench("info", unseen) == 0
+    card = (unseen / "README.md").read_text()
+    assert 'split="test"' in card and "train" not in card
 
 
 def test_it_loads_as_one_split(unseen):
