@@ -324,9 +324,10 @@ def draw_board(board: Board) -> "Figure":
         squares = (board.columns + 1, board.rows + 1)
         markers = cv2.aruco.CharucoBoard(squares, spacing, board.detail_mm, dictionary)
         cells = dictionary.markerSize + 2  # with the black border
-        for number, corners in zip(markers.getIds(), markers.getObjPoints(), strict=True):
+        corners_mm = np.array(markers.getObjPoints())[..., :2] - spacing
+        for number, corners in zip(np.ravel(markers.getIds()), corners_mm, strict=True):
             image = cv2.aruco.generateImageMarker(dictionary, int(number), cells)
-            (x0, y0), (x1, y1) = (corners[corner, :2] - spacing for corner in (0, 2))
+            (x0, y0), (x1, y1) = corners[0], corners[2]
             axes.imshow(image, "gray", extent=(x0, x1, y1, y0), interpolation="none", aspect="auto")
         axes.set(xlim=(left, right), ylim=(bottom, top))
     return sheet
