@@ -116,7 +116,9 @@ def tables(files: list[Path]) -> str:
     for dataset in track():
         rows = [scores.datasets.get(dataset) for scores in methods.values()]
         cells = [
-            "refused" if row is None else f"{row.per_mille:.3g} / {row.answered_per_mille:.3g}"
+            "refused"
+            if row is None
+            else f"{three_digits(row.per_mille)} / {three_digits(row.answered_per_mille)}"
             for row in rows
         ]
         by_rig.append({"dataset": dataset, **dict(zip(methods, cells, strict=True))})

@@ -7,17 +7,21 @@ import pydantic
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_serializer
 
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
-from fpp_ml_bench.files import LARGEST, printable, text_problem
+from fpp_ml_bench.files import LARGEST, NAME_LIMIT, printable, text_problem
 
 MAX_PROBLEMS = 50
+LONGEST_REASON = 2000
+"""Characters of a few sentences, such as why a method refuses a rig."""
 Model = TypeVar("Model", bound="StrictModel")
 
 
-def _checked(value: str) -> str:
-    problem = text_problem(value)
-    if problem is not None:
-        raise ValueError(problem)
-    return value
+def _of_length(limit: int) -> AfterValidator:
+    def checked(value: str) -> str:
+        if problem := text_problem(value, limit):
+            raise ValueError(problem)
+        return value
+
+    return AfterValidator(checked)
 
 
 def as_tuple(value: Any) -> Any:
@@ -31,7 +35,8 @@ def _not_tiny(value: float) -> float:
     return value
 
 
-Text = Annotated[str, AfterValidator(_checked)]
+Text = Annotated[str, _of_length(NAME_LIMIT)]
+Reason = Annotated[str, _of_length(LONGEST_REASON)]
 Scalar = Text | bool | int | float | None
 Positive = Annotated[float, Field(gt=0), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0)]

@@ -109,18 +109,25 @@ def predictions(tmp_path, dataset):
     return write_predictions(tmp_path / "predictions", dataset)
 
 
+def split(words):
+    """The words of a command: a text may hold several, or a whole line; a path is one, spaces and
+    all."""
+    parts = [word.split() if isinstance(word, str) else [str(word)] for word in words]
+    return [word for part in parts for word in part]
+
+
 def fpp_bench(*words):
-    """Exit status of ``fpp-bench`` with these words; a text may hold several, or a whole line."""
+    """Exit status of ``fpp-bench`` with these words, as `split`."""
     from fpp_ml_bench.cli import main
 
-    return main(" ".join(map(str, words)).split())
+    return main(split(words))
 
 
 def fpp_eval(*words):
     """Exit status of ``fpp-eval``, as `fpp_bench`."""
     from fpp_ml_bench.cli import main_eval
 
-    return main_eval(" ".join(map(str, words)).split())
+    return main_eval(split(words))
 
 
 def printed(command, *words):

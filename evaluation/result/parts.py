@@ -22,7 +22,16 @@ from fpp_ml_bench.evaluation.protocol import LEFT_OUT, NOMINAL, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
 from fpp_ml_bench.files import LARGEST
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
-from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
+from fpp_ml_bench.schema import (
+    Count,
+    NonNegative,
+    Positive,
+    Reason,
+    Share,
+    SparseModel,
+    StrictModel,
+    Text,
+)
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Whole = Annotated[int, Field(gt=0)]
@@ -543,7 +552,7 @@ class TrackScores(StrictModel):
     method: Text
     weights_sha256: Sha256 | None
     datasets: Annotated[dict[Text, DatasetScores], Field(min_length=1, max_length=1000)]
-    refused: dict[Text, Text]
+    refused: dict[Text, Reason]
 
     @property
     def title(self) -> str:

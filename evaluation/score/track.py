@@ -19,13 +19,13 @@ from fpp_ml_bench.evaluation.submission.prediction_files import REFUSED_FILE
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.loaders.storage.benchmark import known_track
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.schema import LONGEST_REASON
 from fpp_ml_bench.style import percent, three_digits
 from fpp_ml_bench.tables import Table
 
 SPLIT, TARGET = "test", "depth_exact"
 """What is scored of each dataset: the depth that a method of one frame should find, not the decoded
 one, whose error is a measure here."""
-LONGEST_REASON = 2000
 PER_MILLE = 1000
 
 

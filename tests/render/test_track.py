@@ -137,9 +137,10 @@ def test_a_refused_rig_has_its_reason_and_no_score(small, tmp_path):
         file.unlink()
     with pytest.raises(PredictionError, match=r"rig-02-paper"):
         score_track(below, datasets_below(small))
-    (below / "rig-02-paper" / REFUSED_FILE).write_text("needs another projector\n")
+    reason = "needs another projector" + 20 * ", which tells more of the depth"
+    (below / "rig-02-paper" / REFUSED_FILE).write_text(f"{reason}\n")
     scores = score_track(below, datasets_below(small))
-    assert scores.refused == {"rig-02-paper": "needs another projector"}
+    assert scores.refused == {"rig-02-paper": reason}
     assert scores.lights == ["workshop"] and list(scores.datasets) == ["rig-14-workshop"]
 
 
