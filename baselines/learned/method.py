@@ -87,7 +87,7 @@ class FringeNetTraining:
     )
 
 
-class FringeNetMethod(RouteMethod[Any]):
+class FringeNetMethod(RouteMethod[Measurement]):
     """Depth from one frame whose wrapped phases and object networks give (`fringe_net`); order and
     depth as of `phase` or `crossed`. ``members`` of the shipped ensemble, or the network in
     ``weights`` alone. The first sinusoid of a direction, or a crossed frame: ``fringes``. Raises

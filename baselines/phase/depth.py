@@ -182,6 +182,30 @@ class FringeMeasurement(Measurement):
     candidates: Orders
     expected_error_mm: Image
 
+    @classmethod
+    def of(
+        cls,
+        measured: Measurement,
+        wrapped_phase_rad: Image,
+        order: NDArray[np.int32],
+        candidates: Orders,
+        expected_error_mm: Image,
+    ) -> "FringeMeasurement":
+        """What every measurement states, and these."""
+        return cls(
+            measured.depth_mm,
+            measured.sigma_mm,
+            measured.order_doubt_mm,
+            measured.confidence,
+            measured.modulation_grey,
+            measured.reason,
+            measured.background_share,
+            wrapped_phase_rad,
+            order,
+            candidates,
+            expected_error_mm,
+        )
+
 
 @dataclass(frozen=True)
 class NearnessFit:
@@ -427,8 +451,8 @@ def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMe
     phase = (absolute - TAU * order).astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth_mm = layer.depth_of_residual_mm(phases)
-    return FringeMeasurement(
-        **vars(_restored(model, measured, inside, depth_mm, on_object, nearest)),
+    return FringeMeasurement.of(
+        _restored(model, measured, inside, depth_mm, on_object, nearest),
         wrapped_phase_rad=phase,
         order=np.nan_to_num(order).astype(np.int32),
         candidates=layer.orders_in_range(phase, model.range_mm),
@@ -487,8 +511,8 @@ def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
         * np.float32(np.sqrt(np.pi / 2)),  # of a normal error of that expected size
         order_doubt_mm=_pasted(seen, mm_per_rad * TAU * wrong_chance),
     )
-    measured = FringeMeasurement(
-        **vars(judged),
+    measured = FringeMeasurement.of(
+        judged,
         wrapped_phase_rad=_pasted(seen, seen.phase_rad, np.float32, np.nan),
         order=_pasted(seen, order, np.int32),
         candidates=Orders(first, count),

@@ -28,9 +28,9 @@ from fpp_ml_bench.baselines.phase.observe import (
 )
 from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
 from fpp_ml_bench.baselines.phase.route import (
+    AnyRoute,
     CrossedRoute,
     Measured,
-    Route,
     one_carrier,
     two_carriers,
 )
@@ -109,7 +109,7 @@ class RouteMethod(Method, Generic[Measured]):
     """A method that measures every map of a sample at once by its `route`, which it puts together
     when it is made."""
 
-    route: Route[Any, Any, Any, Any, Measured]
+    route: AnyRoute[Measured]
     mask: NDArray[np.bool_] | None = None
     audited: CrossedRoute | None = None
     """The route, where the calibration is to be audited."""

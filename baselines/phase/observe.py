@@ -13,7 +13,6 @@ other still, which is left in their mean, where the shifted one cancels.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
@@ -376,6 +375,7 @@ class OneCarrier(MeasurementModel):
             inside, fit = self._local_fits(
                 greys, background, crop, inside & ~dark, dark, mask is not None
             )
+        phase, slopes = self._phase_and_slopes(layer, inside, fit)
         return Observation(
             rig=self.rig,
             period_px=self.period_px,
@@ -390,8 +390,10 @@ class OneCarrier(MeasurementModel):
             beyond=dark & self._scene.beyond[crop],
             layer=layer,
             shifts_rad=self.shifts_rad,
+            fit=fit,
+            phase_rad=phase,
+            slopes=slopes,
             mean_grey=mean_grey,
-            **self._told(layer, inside, fit),
         )
 
     def with_object(self, seen: Observation, inside: Mask) -> Observation:
@@ -400,14 +402,16 @@ class OneCarrier(MeasurementModel):
         _, fit = self._local_fits(
             seen.greys, seen.background, seen.crop, inside, np.zeros_like(inside), True
         )
-        return replace(seen, inside=inside, **self._told(seen.layer, inside, fit))
+        phase, slopes = self._phase_and_slopes(seen.layer, inside, fit)
+        return replace(seen, inside=inside, fit=fit, phase_rad=phase, slopes=slopes)
 
-    def _told(self, layer: CalibrationLayer, inside: Mask, fit: FringeFit) -> dict[str, Any]:
-        """A fit, and the phase and slopes that it tells, as fields of an `Observation`."""
+    def _phase_and_slopes(
+        self, layer: CalibrationLayer, inside: Mask, fit: FringeFit
+    ) -> tuple[Image, tuple[Image, Image]]:
+        """The wrapped phase of a fit, and the slopes of what is left of it by the calibration."""
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
-        slopes = phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
-        return {"fit": fit, "phase_rad": phase, "slopes": slopes}
+        return phase, phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
 
     def _local_fits(
         self,

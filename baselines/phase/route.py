@@ -13,7 +13,7 @@ order, its mask and its phase (``learned``).
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from fpp_ml_bench.baselines.phase.candidates import (
     CrossedCandidates,
@@ -46,6 +46,7 @@ Seen = TypeVar("Seen", bound=Capture)
 Offered = TypeVar("Offered")
 Chosen = TypeVar("Chosen")
 Measured = TypeVar("Measured", bound=Measurement)
+Measured_co = TypeVar("Measured_co", bound=Measurement, covariant=True)
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,16 @@ class Route(Generic[ModelT, Seen, Offered, Chosen, Measured]):
         offered = self.candidates(seen)
         # By what each of them costs, and by neighbours.
         return self.order(seen, offered)
+
+
+class AnyRoute(Protocol[Measured_co]):
+    """What a method uses of its route, of one carrier or two."""
+
+    @property
+    def model(self) -> MeasurementModel: ...
+    def measure(self, frames: Frames, mask: Mask | None = None) -> Measured_co: ...
+    @property
+    def observe(self) -> Callable[[Frames, Mask | None], Capture]: ...
 
 
 FringeRoute = Route[OneCarrier, Observation, FringeCandidates, FringeOrder, FringeMeasurement]

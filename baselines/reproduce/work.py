@@ -19,7 +19,7 @@ from statistics import fmean
 from textwrap import shorten
 from threading import Event, Thread
 from time import time
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
@@ -67,10 +67,23 @@ LOOK_EVERY_S = 2.0
 """How often the bar of several trainings reads their logs."""
 
 
+class Keeper(Protocol):
+    """What keeps the rows of a run, the module `fpp_ml_bench.leaderboard.reproduced`: this room may
+    not import it."""
+
+    def write_measured(self, result: Result, path: Path) -> None: ...
+    def row_that_holds(
+        self, path: Path, opened: DatasetFolder, value: str, setting: str = ...
+    ) -> object | None: ...
+    def check_row_is_of(self, path: Path, opened: DatasetFolder) -> None: ...
+    def write_table(
+        self, table: str, settings: "ReproduceSettings", outcome: "Outcome"
+    ) -> Path: ...
+
+
 @dataclass(frozen=True)
 class ReproduceSettings:
-    """Settings of a run. ``leaderboard`` keeps the rows: the module
-    `fpp_ml_bench.leaderboard.reproduced`, which this room may not import; ``minutes`` limits the trainings;
+    """Settings of a run. ``leaderboard`` keeps the rows; ``minutes`` limits the trainings;
     ``command`` continues it; ``anyway`` trains the paper's preset without a GPU; ``only_missing``
     keeps rows that are up to date; ``report`` takes a line of progress; ``row``: the only row of
     the table to make, "" for all; ``from_scratch``: train even where weights come with the package;
@@ -80,7 +93,7 @@ class ReproduceSettings:
     tables: Sequence[str]
     folders: Folders
     command: str
-    leaderboard: Any
+    leaderboard: Keeper
     data: Path | None = None
     only_missing: bool = False
     minutes: float | None = None
