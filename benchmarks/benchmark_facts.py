@@ -31,7 +31,7 @@ def counts(dataset: DatasetFolder, split: str, mode: str, target: str) -> dict[s
     """Samples, object pixels and void pixels of each object of a split."""
     found: dict[str, list[int]] = {}
     for sample in dataset.samples(split):
-        inside, void = object_mask(dataset.target_mm(sample, target)), dataset.void(sample, target)
+        inside, void = object_mask(dataset.depth_mm(sample, target)), dataset.void(sample, target)
         void &= mode == "standard"
         numbers = found.setdefault(dataset.measured(sample)["object"], [0, 0, 0])
         for place, number in enumerate(
@@ -47,7 +47,7 @@ def undecoded_share(dataset: DatasetFolder, split: str) -> float:
     depth."""
     counted = undecoded = 0
     for sample in dataset.samples(split):
-        inside = object_mask(dataset.target_mm(sample, "depth_exact")) & ~dataset.void(
+        inside = object_mask(dataset.depth_mm(sample, "depth_exact")) & ~dataset.void(
             sample, "depth_exact"
         )
         counted += np.count_nonzero(inside)

@@ -111,7 +111,7 @@ def measured(
     method = load_method(name, dataset, **options)
     rows, parts = [], []
     for number, sample in enumerate(samples):
-        exact = dataset.target_mm(sample, DEPTH_EXACT)
+        exact = dataset.depth_mm(sample, DEPTH_EXACT)
         inside, void = object_mask(exact), dataset.void(sample, DEPTH_EXACT)
         whole: list[Any] = [None] * len(dataset.sequence)
         for used in method.frames_used:

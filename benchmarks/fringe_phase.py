@@ -163,7 +163,7 @@ def main() -> int:
     samples = [name for views in of_object for name in views[: given.views]]
     rows: dict[str, list[list[float]]] = {}
     for sample in samples:
-        exact = dataset.target_mm(sample, DEPTH_EXACT)
+        exact = dataset.depth_mm(sample, DEPTH_EXACT)
         inside, void = object_mask(exact), dataset.void(sample, DEPTH_EXACT)
         near = object_near_edges(exact, [EDGE_BAND_PX])[0]
         truth, found = phases(dataset, sample, given.fringes, methods, inside, exact)

@@ -40,6 +40,7 @@ from fpp_ml_bench.constants import OBJECTS, VIEW_DEGREES, VIEWS, split_of
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.light import load_light
+from fpp_ml_bench.loaders.render.lighting import ObjectLight
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.pixels import mixed_pixels
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
@@ -105,7 +106,7 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
     frames = [row.frames[i] for i in range(len(rig.sequence))]
     seen = np.zeros(row.depth_mm.shape, dtype=bool)
     seen.ravel()[hits.pixels] = True
-    upon = studio.lighting.upon(mesh, traced, degrees, offset_m)
+    upon = ObjectLight(studio.lighting, mesh, traced, degrees, offset_m)
     shaded = scene.lit.gain > 0 if light.bounces.shadows else None
     points_m = _points_m(scene.hits, rig)
     count, across = len(frames), light.camera.rays_across
@@ -125,7 +126,9 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
         ),
         (
             "bounces",
-            (lambda: studio.lighting.upon(mesh, traced, degrees, offset_m)) if surfels else None,
+            (lambda: ObjectLight(studio.lighting, mesh, traced, degrees, offset_m))
+            if surfels
+            else None,
             1,
         ),
         ("light of the central rays", lambda: upon.at(points_m, hits.normals, hits.triangle), 1),

@@ -113,7 +113,7 @@ def table(dataset: Path, predictions: Path) -> Table:
         sigmas.append(
             np.load(stated).astype(np.float32) if stated.exists() else np.zeros_like(depths[-1])
         )
-        truths.append(np.array(opened.target_mm(sample, DEPTH_EXACT), np.float32))
+        truths.append(np.array(opened.depth_mm(sample, DEPTH_EXACT), np.float32))
         flags.append(np.where(opened.void(sample, DEPTH_EXACT), np.uint8(Flag.UNLIT), np.uint8(0)))
     rig = opened.rig
     found = Table("Attack", numbers=SHOWN)

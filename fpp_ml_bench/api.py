@@ -257,8 +257,8 @@ def evaluate(
         "objects": objects,
         "units": units,
         "nodata": nodata,
+        "charge_mm": charge_mm,
     }
-    in_memory["charge_mm"] = charge_mm
     if not isinstance(predictions, (str, Path)):
         if isinstance(dataset, (str, Path, DatasetFolder)):
             raise PredictionError(

@@ -146,15 +146,6 @@ def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) ->
     return edge
 
 
-def object_near_edge(
-    depth_mm: NDArray[np.floating], band_px: int, jump_mm: float | None = None
-) -> NDArray[np.bool_]:
-    """Object pixels nearer than ``band_px`` to one of `depth_edges`, bool (H, W). By dilation,
-    which for a narrow band is several times faster than a distance transform, and needs no OpenCV
-    (slower to import than ten samples to score)."""
-    return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
-
-
 def object_box(inside: NDArray[np.bool_]) -> tuple[slice, slice] | None:
     """Rows and columns of a mask (H, W) and one pixel around it: they hold every depth edge of an
     object with this mask. None for an empty mask; the whole image where `skipping_enabled` says
@@ -171,7 +162,9 @@ def object_box(inside: NDArray[np.bool_]) -> tuple[slice, slice] | None:
 def object_near_edges(
     depth_mm: NDArray, bands_px: Sequence[int], jump_mm: float | None = None
 ) -> list[NDArray]:
-    """`object_near_edge` for several bands; the edges are computed once."""
+    """For each of several bands the object pixels nearer than it to one of `depth_edges`, bool (H,
+    W). By dilation, which for a narrow band is several times faster than a distance transform, and
+    needs no OpenCV (slower to import than ten samples to score)."""
     near_edge = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
     inside = object_mask(depth_mm)
     if (box := object_box(inside)) is None:

@@ -9,7 +9,7 @@ import shutil
 import stat
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from itertools import accumulate
@@ -76,6 +76,12 @@ def printable(value: object, limit: int = NAME_LIMIT) -> str:
         for c in text[:limit]
     )
     return escaped + ("..." if len(text) > limit else "")
+
+
+def first_of(names: Sequence[str], most: int) -> str:
+    """The first ``most`` names as text, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 @contextmanager
@@ -161,12 +167,10 @@ def read_yaml(
     return _read(path, strict_yaml, "plain YAML", raised, cure, limit)
 
 
-def read_json(
-    path: Path, raised: type[FppBenchError], cure: str = CORRECT, limit: int = 1 << 26
-) -> Any:
+def read_json(path: Path, raised: type[FppBenchError], cure: str = CORRECT) -> Any:
     """The plain values of a JSON file, as `strict_json`; ``raised`` with file, problem and
     ``cure``."""
-    return _read(path, strict_json, "valid JSON", raised, cure, limit)
+    return _read(path, strict_json, "valid JSON", raised, cure, 1 << 26)
 
 
 def _read(

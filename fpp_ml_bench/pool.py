@@ -54,8 +54,13 @@ def mapping(work: object, workers: int = 1, cluster: str | None = None) -> Itera
         yield lambda function, *items: map(partial(function, work), *items)
     else:
         with single_threaded_algebra():
-            with shared_memory():
+            try:  # what processes share is made here: in /dev/shm on Linux
                 pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (work,))
+            except OSError as error:
+                raise PoolError(
+                    f"shared memory (/dev/shm) can't be used ({cause_of(error)}); have it mounted "
+                    f"writable and with free space (Docker: --shm-size), or give --workers 1"
+                ) from error
             try:
                 yield lambda function, *items: pool.map(partial(_call, function), *items)
             except BaseException as error:
@@ -72,31 +77,14 @@ def mapping(work: object, workers: int = 1, cluster: str | None = None) -> Itera
                 pool.shutdown(cancel_futures=True)
 
 
-@contextmanager
-def shared_memory() -> Iterator[None]:
-    """Raise `PoolError` where what processes share can't be made within: in /dev/shm on Linux."""
-    try:
-        yield
-    except OSError as error:
-        raise PoolError(
-            f"shared memory (/dev/shm) can't be used ({cause_of(error)}); have it mounted writable "
-            f"and with free space "
-            "(Docker: --shm-size), or give --workers 1"
-        ) from error
-
-
 def _begin(work: object) -> None:
-    global _work
-    begin_worker()
-    _work = "", work
-
-
-def begin_worker() -> None:
     """In a new worker process: its parent alone is interrupted from the keyboard, and when the
     parent ends, however it does, so does this process: an orphan would stay for ever, or write into
     an unlocked folder."""
+    global _work
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    _work = "", work
 
 
 def _end_with_parent() -> None:

@@ -83,6 +83,12 @@ def gaussian_weights(variance: float, sigmas: float = 4.0) -> NDArray[np.float64
     return weights / math.fsum(weights)
 
 
+def dot(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+    """Dot products along the second axis, of three entries, added in order: `einsum` may fuse
+    multiplications and additions."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
 def matrix_product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Matrix product of (3, 3) and (3, n), added in order."""
     return a[:, :1] * b[0] + a[:, 1:2] * b[1] + a[:, 2:] * b[2]

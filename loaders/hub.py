@@ -323,7 +323,7 @@ class Hub:
         changes: list[Change],
         remote: Remote,
         private: bool,
-        sent: Callable[[int], None] = lambda count: None,
+        sent: Callable[[int], None],
     ) -> str:
         """Make the repository where there is none, send new and changed files, and commit; returns
         the commit's URL. All files become visible together; a run after an interrupted one sends
@@ -543,9 +543,7 @@ class Download:
     cache: Path
 
 
-def plan_download(
-    hub: Hub, repository: str, revision: str | None = None, raw_scans: bool = False
-) -> Download:
+def plan_download(hub: Hub, repository: str, revision: str | None, raw_scans: bool) -> Download:
     """What an import of ``repository`` at ``revision`` (branch, tag or commit; None: its main
     branch) downloads: the depth variant that it reads, the depth ranges and, with ``raw_scans``,
     the frames of the raw scans. Raises `RemoteError` as `Hub.state`, `LayoutError` for a repository

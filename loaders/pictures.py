@@ -329,9 +329,7 @@ def sample_cloud(dataset: DatasetFolder, sample: str, folder: Path, name: str) -
     return write_cloud(folder, name, f"{sample}: {kind} depth", dataset.rig, depth_mm, grey)
 
 
-def contact_sheet(
-    dataset: DatasetFolder, split: str, path: Path, most_views: int = len(VIEWS)
-) -> None:
+def contact_sheet(dataset: DatasetFolder, split: str, path: Path, most_views: int) -> None:
     """Write the objects of ``split`` as a PNG, each in its first ``most_views`` views, in white
     light if that frame is stored. Grey levels are raised to the power `_BRIGHTER`. Raises
     `DatasetError` for no view, or a place that can't be written."""

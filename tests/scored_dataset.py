@@ -140,7 +140,7 @@ def pixel_counts(
     """Samples, object pixels and void pixels of each object of a split."""
     counts: dict[str, list[int]] = {}
     for sample in dataset.samples(split):
-        inside = dataset.target_mm(sample, target) > 0
+        inside = dataset.depth_mm(sample, target) > 0
         void = dataset.void(sample, target) & (mode == "standard")
         numbers = counts.setdefault(dataset.measured(sample)["object"], [0, 0, 0])
         for place, number in enumerate((1, int((inside & ~void).sum()), int(void.sum()))):

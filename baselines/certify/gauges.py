@@ -118,7 +118,7 @@ class Volume:
         top, bottom = (
             (y - camera.cy) / camera.fy for y in (MARGIN_PX, camera.height - 1 - MARGIN_PX)
         )
-        near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+        near_m, far_m = rig.range_m
         return cls(rig, near_m, far_m, np.array([left, right, top, bottom]))
 
     @property
@@ -138,13 +138,10 @@ class Volume:
         """Whether camera and projector see all of ``points_m`` (n, 3) within the range."""
         x, y, z = points_m.T
         left, right, top, bottom = self.slopes
-        u, v = self.rig.project(points_m)
-        projector = self.rig.projector
         return bool(
             ((z >= self.near_m) & (z <= self.far_m)).all()
             and ((x >= left * z) & (x <= right * z) & (y >= top * z) & (y <= bottom * z)).all()
-            and ((u >= 0) & (u <= projector.width - 1)).all()
-            and ((v >= 0) & (v <= projector.height - 1)).all()
+            and self.rig.projector.holds(*self.rig.project(points_m), 0.5).all()
         )
 
     def placed(self, points_m: Vector, corner: Vector) -> Vector:

@@ -185,7 +185,7 @@ class Identifiability(Probe):
         for number, sample in enumerate(samples):
             progress(number, len(samples), sample)
             target = "depth_exact" if dataset.has_exact else "depth"
-            depth_mm = dataset.target_mm(sample, target)
+            depth_mm = dataset.depth_mm(sample, target)
             answer = subject.predict(subject.captured(dataset, sample)) if own else None
             for code in codes:
                 bound = alike(rig, code, depth_mm)

@@ -145,7 +145,7 @@ def twins_of(
     own position and a period away, or half a period to either side. Raises `DiagnosisError` where
     there is none."""
     rig = renderer.rig
-    near_m, far_m = (end / MM_PER_M for end in rig.working_range_mm)
+    near_m, far_m = rig.range_m
     in_focus = SceneRenderer(rig, renderer.lamp.changed("projector", defocus_px=0.0))
     sinusoids = rig.sequence.sinusoids
     frame, across = (

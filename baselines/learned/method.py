@@ -15,6 +15,7 @@ from fpp_ml_bench.baselines.phase.depth import Measurement
 from fpp_ml_bench.baselines.phase.method import (
     ANYWAY,
     AUDIT,
+    AUDITED,
     RANGE_AND_WALL,
     RouteMethod,
     crossed_image,
@@ -195,6 +196,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
         frame = f"one {fringes} frame{pitch_words(other_pitch)}"
         self.title = f"Wrapped phase and mask of {frame} by {count}; order measured{more}"
+        self.title += AUDITED if audited else ""
         hashes = [file.sha256 for file in files]
         self.settings = {
             **{key: value for key, value in vars(given).items() if key not in ("audit", "anyway")},

@@ -317,9 +317,8 @@ def pattern_on_plane(rig: Rig, depth_m: float) -> tuple[Image, Mask]:
     x, y = rig.camera.rays()
     if not np.isfinite(depth_m):
         return np.ones(x.shape, np.float32), np.zeros(x.shape, bool)
-    u, v = rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
-    width, height = rig.projector.width, rig.projector.height
-    lit = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+    u, v = rig.seen((x, y), depth_m)
+    lit = rig.projector.holds(u, v)
     square = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
     plain = lit.astype(np.uint8)
     edge = cv2.dilate(plain, square) != cv2.erode(plain, square, borderValue=1)

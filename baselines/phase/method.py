@@ -92,6 +92,8 @@ AUDIT = (
 )
 """Help of ``--audit``."""
 ANYWAY = "with --audit: take frames that the calibration does not fit, too"
+AUDITED = ", its calibration audited"
+"""End of the title of a method with ``--audit``."""
 
 
 @dataclass(frozen=True)
@@ -343,10 +345,12 @@ class CrossedMethod(RouteMethod[Measurement]):
         model = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), moved=moved)
         self.route = route = two_carriers(model)
         pitches = " and ".join(f"{pitch:g}" for pitch in model.family.pitches_px)
-        self.title = f"Crossed fringes of {pitches} px, {count}, nothing learned"
+        audited = self.use_audit(route, given.audit, given.anyway)
+        self.title = (
+            f"Crossed fringes of {pitches} px, {count}, nothing learned{AUDITED if audited else ''}"
+        )
         self.settings = {"min_confidence": given.min_confidence} | self.use_mask(given.mask)
-        self.settings |= {} if frames == 1 else {"frames": frames}
-        self.settings |= self.use_audit(route, given.audit, given.anyway)
+        self.settings |= ({} if frames == 1 else {"frames": frames}) | audited
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:

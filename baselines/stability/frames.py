@@ -29,7 +29,7 @@ from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.gray_code import bits_needed, cell_count
 from fpp_ml_bench.coding.phase_shift import minus_atan2, wrapped_phase
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding.blocks import plan_direction, projected
+from fpp_ml_bench.decoding.blocks import plan_direction
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.rig import Rig
@@ -135,7 +135,7 @@ def plane_stack(
     rays = rig.camera.rays()
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
     inside = np.ones(rays[0].shape, bool)
-    for direction, px in zip(AXES, projected(rays, PLANE_M, rig), strict=True):
+    for direction, px in zip(AXES, rig.seen(rays, PLANE_M), strict=True):
         levels = grey(direction_levels(rig, px.ravel(), direction, mean, modulation)).reshape(
             -1, *px.shape
         )
@@ -454,7 +454,7 @@ def plane_outcome(
 ) -> Outcome:
     """The worst pixel of a plane that ``family`` lights, flagged where the route gives a reason or
     no depth. ``measured_as``: the family that the route takes it for."""
-    u, v = projected(rig.camera.rays(), DEPTH_M, rig)
+    u, v = rig.seen(rig.camera.rays(), DEPTH_M)
     pairs = zip(family.weights, family.cycles_per_px, strict=True)
     waves = sum(weight * np.cos(2 * np.pi * (a * u + b * v)) for weight, (a, b) in pairs)
     noise = np.random.default_rng(4).normal(0, NOISE, u.shape)

@@ -18,7 +18,9 @@ name.
 """
 
 import argparse
+import io
 import sys
+from collections.abc import Mapping
 
 import containers
 import household
@@ -30,7 +32,7 @@ from solids import DRAWINGS, on_grid
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.render.meshes import MESH_GRID_MM, MESHES_FILE, pack_meshes, stored_mesh
+from fpp_ml_bench.loaders.render.meshes import MESH_GRID_MM, MESHES_FILE, stored_mesh
 
 DRAWN_BY = (containers, household, tools, unseen)
 """The modules whose functions are in `DRAWINGS`."""
@@ -44,6 +46,17 @@ def drawing(name: str) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     solid = on_grid(DRAWINGS[name](), MESH_GRID_MM).as_original().simplify(SLIVER_MM).to_mesh64()
     steps = np.rint(solid.vert_properties[:, :3] / MESH_GRID_MM).astype(np.int64)
     return steps, np.asarray(solid.tri_verts, dtype=np.int32)
+
+
+def pack_meshes(meshes: Mapping[str, tuple[NDArray[np.integer], NDArray[np.integer]]]) -> bytes:
+    """Content of `MESHES_FILE` for vertices and faces as `stored_mesh` gives them."""
+    rows = {}
+    for name, parts in meshes.items():
+        for part, values in zip(("vertices", "faces"), parts, strict=True):
+            rows[f"{name}.{part}"] = np.diff(values, axis=0, prepend=0).astype(np.int32)
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **rows)
+    return content.getvalue()
 
 
 def main() -> int:

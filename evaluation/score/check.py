@@ -215,7 +215,7 @@ class Rules:
         """`scored_pair` of ``values`` (H, W) and the sample's target."""
         normalised = self.units == "normalised"
         left_out = dataset.left_out(sample, self.range_rule, self.target) if normalised else None
-        target_mm = dataset.target_mm(sample, self.target)
+        target_mm = dataset.depth_mm(sample, self.target)
         return scored_pair(values, target_mm, self.units, self.mode, sample, left_out)
 
     def void(self, dataset: DatasetFolder, sample: str) -> NDArray[np.bool_] | None:

@@ -231,7 +231,7 @@ def _scored(
 
     def work(sample: str) -> Scored | list[str]:
         with dataset_lock:  # reading the dataset need not be thread-safe
-            target = dataset.target_mm(sample, rules.target)
+            target = dataset.depth_mm(sample, rules.target)
             void = rules.void(dataset, sample)
             unlit_mm = (
                 dataset.unlit_mm(sample)
@@ -463,7 +463,7 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str) -> Explanation
     samples, (height, width) = dataset.samples(split), dataset.size
     boxes = {}
     for sample in samples:
-        boxes[sample] = _box_px(object_mask(dataset.target_mm(sample, target)))
+        boxes[sample] = _box_px(object_mask(dataset.depth_mm(sample, target)))
         dataset.release(sample)
     frames, depths = len(dataset.manifest.stored_frames), 1 + dataset.has_exact
     read, searched = 1 + (target != "depth"), sum(boxes.values())

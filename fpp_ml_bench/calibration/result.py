@@ -128,8 +128,7 @@ class FittedPose:
 @dataclass(frozen=True)
 class Calibration:
     """A calibrated rig. A point goes from the camera's frame to the projector's by ``X_p = rotation
-    X_c + translation_mm``; ``rotation_sigma_rad`` is the uncertainty of a small turn about the axes
-    of OpenCV's rotation vector. ``scale`` says what the lengths were taken from. ``alone_rms_px``:
+    X_c + translation_mm``. ``scale`` says what the lengths were taken from. ``alone_rms_px``:
     the RMS of cv2.calibrateCamera for camera and projector each on its own with a perfect board.
     ``noise_px``: standard deviations of camera and projector coordinates that the residuals show,
     with whose inverse squares they were weighted. ``bic``: Bayesian information criterion.
@@ -144,7 +143,6 @@ class Calibration:
     projector: Device
     rotation: tuple[tuple[float, float, float], ...]
     translation_mm: tuple[float, float, float]
-    rotation_sigma_rad: tuple[float, ...]
     translation_sigma_mm: tuple[float, ...]
     scale: str
     alone_rms_px: tuple[float, float]

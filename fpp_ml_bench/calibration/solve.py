@@ -326,7 +326,6 @@ def _result(
         devices[1],
         tuple(map(tuple, cv2.Rodrigues(turn)[0].tolist())),
         tuple((factor * shift).tolist()),
-        tuple(sigma[bundle.stereo][:3].tolist()),
         tuple((factor * np.linalg.norm(of_shift, axis=1)).tolist()),
         scale,
         alone,

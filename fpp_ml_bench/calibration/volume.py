@@ -53,11 +53,9 @@ class Places:
     def at(cls, rig: Rig, column: NDArray, row: NDArray, depth_mm: NDArray) -> "Places":
         """The points seen at ``column`` and ``row`` (n,) px, at depths (d, n) or (d, 1). Raises
         `CalibrationError` where none of them is on the pattern."""
-        x, y = rig.camera.normalised(column, row)
         depth_m = np.broadcast_to(depth_mm, (len(depth_mm), len(column))) / MM_PER_M
-        u, v = rig.project(np.stack([x * depth_m, y * depth_m, depth_m], axis=-1))
-        inside = (u >= -0.5) & (u <= rig.projector.width - 0.5)
-        shown = inside & (v >= -0.5) & (v <= rig.projector.height - 0.5)
+        u, v = rig.seen(rig.camera.normalised(column, row), depth_m)
+        shown = rig.projector.holds(u, v)
         if not shown.any():
             raise CalibrationError(
                 "no point of the true rig's working range is on both image and pattern; check that "

@@ -56,7 +56,7 @@ def gigabytes(count: float) -> str:
 def contents(manifest: "Manifest") -> str:
     """What a dataset holds, as text: samples of each split, images and bytes."""
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
-    images = len(manifest.stored_frames) * sum(map(len, manifest.samples.values()))
+    images = len(manifest.stored_frames) * len(manifest.rows)
     return (
         f"{parts} samples, {images:,} images, "
         f"{gigabytes(sum(file.bytes for file in manifest.files))}"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.calibration.volume import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
-from fpp_ml_bench.cli.options import SPLITS, command, names, new_file, value
+from fpp_ml_bench.cli.options import SPLITS, command, new_file, some_of
 from fpp_ml_bench.constants import MM_PER_M, VIEWS
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.evaluation.result.file import write_json
@@ -22,7 +22,6 @@ from fpp_ml_bench.loaders.published.exporting import (
     FORMS,
     MAP_FORMS,
     SAMPLE_FORMS,
-    Maps,
     chosen_splits,
 )
 from fpp_ml_bench.loaders.published.exporting import export as export_published
@@ -38,6 +37,7 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import Sequence
 from fpp_ml_bench.options import REQUIRED, argument, option
+from fpp_ml_bench.style import percent
 from fpp_ml_bench.tables import Table
 
 
@@ -148,13 +148,9 @@ def _fringe_lines(rig: "Rig") -> list[str]:
     return [f"fringes         {coded}; periods in range {periods}", f"sampling        {sampled}"]
 
 
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.2f}%"
-
-
 _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("objects, samples", lambda s: f"{s['objects']}, {s['samples']}"),
-    ("cover, mean", lambda s: _share(s["cover_mean"])),
+    ("cover, mean", lambda s: percent(s["cover_mean"], 2)),
     ("cover, least-most", lambda s: f"{100 * s['cover_min']:.1f}-{100 * s['cover_max']:.1f}%"),
     ("depth range, median", lambda s: f"{s['depth_range_median_mm']:.0f}"),
     ("depth range, largest", lambda s: f"{s['depth_range_max_mm']:.0f}"),
@@ -162,7 +158,7 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("  RMSE", lambda s: millimetres(s["gt_rmse_mm"])),
     ("  MAE inside (3 px from edges)", lambda s: millimetres(s["gt_interior_mae_mm"])),
     ("  largest", lambda s: millimetres(s["gt_max_mm"])),
-    ("pixels without ground truth", lambda s: _share(s["undecoded_share"])),
+    ("pixels without ground truth", lambda s: percent(s["undecoded_share"], 2)),
 )
 
 
@@ -229,7 +225,7 @@ def _prediction_picture(
     split = opened.split_of_sample(sample)
     target = DEPTH_EXACT if opened.has_exact else DEPTH
     submission, depth_mm = predicted_mm(folder, opened, split, sample, target)
-    target_mm = np.where(opened.void(sample, target), 0, opened.target_mm(sample, target))
+    target_mm = np.where(opened.void(sample, target), 0, opened.depth_mm(sample, target))
     title = f"{sample}: {submission.name}, {opened.size[1]} x {opened.size[0]} px"
     frame = opened.frame(sample, next(iter(submission.frames_used), 0))
     drawn = front_picture(frame, depth_mm, target_mm, opened.rig, title)
@@ -256,7 +252,7 @@ def verify(
     for finding in findings:
         print(finding)
     size = gigabytes(sum(file.bytes for file in files))
-    samples = sum(len(rows) for rows in manifest.samples.values())
+    samples = len(manifest.rows)
     if findings:
         print(f"{dataset}: {len(findings)} finding(s) in {len(files)} files, {size}")
         return CHECK_FAILED
@@ -288,11 +284,7 @@ def export(
         "depth maps, a file a sample: pfm (float32 mm), png (16 bits, png_scale.txt says the unit), "
         "ply (points in mm)",
         "A,B",
-        parse=value(
-            f"some of {', '.join(MAP_FORMS)}",
-            names,
-            lambda some: some != () and set(some) <= {*MAP_FORMS},
-        ),
+        parse=some_of(MAP_FORMS),
     ),
     predictions: Path | None = option(
         None, "with --maps: those of this folder of predictions, of one split", "DIR"
@@ -330,7 +322,7 @@ def export(
     samples = sum(len(opened.samples(part)) for part in splits)
     steps = samples * sum(form in SAMPLE_FORMS for form in forms)
     with progress_bar("exporting", steps, "samples") as advance:
-        export_published(opened, out, forms, splits, usable_cores(), advance, Maps(maps, depth_mm))
+        export_published(opened, out, forms, splits, usable_cores(), advance, maps, depth_mm)
     files = [path for path in out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")

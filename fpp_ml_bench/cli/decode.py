@@ -7,7 +7,7 @@ from time import perf_counter
 import numpy as np
 
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
-from fpp_ml_bench.cli.options import AT_LEAST_ONE, WORKING_RANGE, command, names, value
+from fpp_ml_bench.cli.options import AT_LEAST_ONE, WORKING_RANGE, command, some_of
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import CaptureError
@@ -71,9 +71,7 @@ def decode(
         "camera axes: x right, "
         "y down, z forward",
         "A,B",
-        parse=value(
-            f"some of {', '.join(FORMS)}", names, lambda some: some != () and set(some) <= {*FORMS}
-        ),
+        parse=some_of(FORMS),
     ),
     anyway: bool = option(False, "decode a capture that its examination refuses"),
     threads: int = option(

@@ -233,7 +233,7 @@ def _written(settings: ImportSettings, plan: Assembly[RowReader]) -> tuple[Manif
 
 def _print_captures(manifest: "Manifest") -> None:
     """Print what was decoded of each capture, those with the least first where there are many."""
-    rows = [row for part in manifest.samples.values() for row in part]
+    rows = manifest.rows
     shown = (
         rows
         if len(rows) <= _MOST_SHOWN

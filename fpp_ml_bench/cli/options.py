@@ -59,6 +59,12 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
+def some_of(choices: Sequence[str]) -> Any:
+    """Some of the ``choices``, with commas between them."""
+    listed = f"some of {', '.join(choices)}"
+    return value(listed, names, lambda some: some != () and set(some) <= {*choices})
+
+
 def number_pair(text: str) -> tuple[float, float]:
     """Two numbers with a comma between them."""
     first, second = (float(part) for part in text.split(","))

@@ -170,9 +170,12 @@ class Fringes:
         return np.array(self.shifts_deg) / 360.0
 
     @property
-    def equal_steps(self) -> bool:
-        """Whether step n is shifted by n / N of a period."""
-        return self.shifts_deg == equal_shifts(len(self.shifts_deg), 1)
+    def steps(self) -> int:
+        return len(self.shifts_deg)
+
+    def equal_steps(self, sign: int = 1) -> bool:
+        """Whether step n is shifted by ``sign`` n / N of a period."""
+        return self.shifts_deg == equal_shifts(self.steps, sign)
 
 
 def equal_shifts(steps: int, sign: int) -> tuple[float, ...]:
@@ -251,13 +254,9 @@ class PhaseShift(Code):
             "scheme": self.scheme,
             "pitches_px": [fringe.pitch_px for fringe in self.fringes],
         }
-        steps = [len(fringe.shifts_deg) for fringe in self.fringes]
         for sign in (1, -1):
-            if all(
-                f.shifts_deg == equal_shifts(n, sign)
-                for f, n in zip(self.fringes, steps, strict=True)
-            ):
-                content |= {"steps": steps, "sign": sign}
+            if all(fringe.equal_steps(sign) for fringe in self.fringes):
+                content |= {"steps": [fringe.steps for fringe in self.fringes], "sign": sign}
                 break
         else:
             content["shifts_deg"] = [list(fringe.shifts_deg) for fringe in self.fringes]
@@ -274,7 +273,7 @@ class PhaseShift(Code):
         frames = [
             Shown("sinusoid", step, number)
             for number, fringe in enumerate(self.fringes)
-            for step in range(len(fringe.shifts_deg))
+            for step in range(fringe.steps)
         ]
         return (*frames, *(self.gray.shown if self.gray else ()))
 
@@ -292,12 +291,7 @@ class PhaseShift(Code):
         """Whether it is the paper's kind: equal steps of one period from pixel 0, Gray code in half
         periods."""
         (first, *others), gray = self.fringes, self.gray
-        plain = (
-            not others
-            and first.equal_steps
-            and len(first.shifts_deg) >= 3
-            and self.origin_px == 0.0
-        )
+        plain = not others and first.equal_steps() and first.steps >= 3 and self.origin_px == 0.0
         return plain and gray is not None and gray == GrayCells(first.pitch_px / 2, gray.bits)
 
     def check(self, length_px: int) -> None:
@@ -318,9 +312,9 @@ class PhaseShift(Code):
     def profiles(self, length_px: int) -> NDArray[np.uint8]:
         rows, position, half = [], np.arange(length_px), GREY_LEVELS / 2
         for fringe in self.fringes:
-            steps = len(fringe.shifts_deg)
+            steps = fringe.steps
             for step, turns in enumerate(fringe.turns):
-                if fringe.equal_steps and self.origin_px == 0.0:
+                if fringe.equal_steps() and self.origin_px == 0.0:
                     angle = (position * steps + step * fringe.pitch_px) / (fringe.pitch_px * steps)
                 else:
                     angle = (position - self.origin_px) / fringe.pitch_px + turns
@@ -332,7 +326,7 @@ class PhaseShift(Code):
         phases, modulations, means, first = [], [], [], 0
         saturated = np.zeros(levels.shape[1], dtype=bool)
         for fringe in self.fringes:
-            steps = len(fringe.shifts_deg)
+            steps = fringe.steps
             if steps < 3:
                 raise DecodeError(
                     f"a period of {fringe.pitch_px:g} px was projected with {steps} step(s); a "
@@ -404,7 +398,7 @@ class PhaseShift(Code):
             for other in others:
                 turns = away / self.fringes[other].pitch_px - phases[other]
                 turns -= np.rint(turns)
-                misfit += len(self.fringes[other].shifts_deg) * (modulations[other] * turns) ** 2
+                misfit += self.fringes[other].steps * (modulations[other] * turns) ** 2
             misfit[(away + self.origin_px < -0.5) | (away + self.origin_px > length_px - 0.5)] = (
                 np.inf
             )
@@ -434,14 +428,14 @@ class PhaseShift(Code):
             turns = (coordinate_px - self.origin_px) / fringe.pitch_px - phases[index]
             with np.errstate(invalid="ignore"):
                 own = coordinate_px - (turns - np.rint(turns)) * fringe.pitch_px
-            weight = len(fringe.shifts_deg) * (modulations[index] / fringe.pitch_px) ** 2
+            weight = fringe.steps * (modulations[index] / fringe.pitch_px) ** 2
             total, weights = total + weight * own, weights + weight
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(weights > 0, total / weights, coordinate_px)
 
     def sigma_px(self, modulation: ArrayLike, noise_grey: ArrayLike) -> NDArray[np.float64]:
         precision = sum(
-            len(fringe.shifts_deg) / 2 / fringe.pitch_px**2
+            fringe.steps / 2 / fringe.pitch_px**2
             for fringe in self.fringes
             if fringe.pitch_px <= FINE_RATIO * self.pitch_px
         )

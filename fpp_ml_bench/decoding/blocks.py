@@ -16,7 +16,6 @@ from fpp_ml_bench.coding.code import (
 )
 from fpp_ml_bench.coding.gray_code import INCONSISTENT_RAD, cell_centres_rad
 from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, choose_steps, phase_weights
-from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, geometry
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics.pinhole import Maps
@@ -128,18 +127,6 @@ def plan_direction(rig: Rig, direction: Direction, steps: int | None) -> CodePla
     )
 
 
-def range_m(rig: Rig) -> tuple[float, float]:
-    """The near and far end of the working range in m."""
-    near_mm, far_mm = rig.working_range_mm
-    return near_mm / MM_PER_M, far_mm / MM_PER_M
-
-
-def projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
-    """Projector px (u, v) of the rays' points at ``depth_m``; NaN behind the projector."""
-    x, y = rays
-    return rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
-
-
 def depth_and_reason(
     measured: dict[Direction, Coordinates], rays: Maps, rig: Rig, limits: Limits
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -189,6 +176,6 @@ def within_reach(
     reached = np.empty(len(coordinate_px), dtype=np.bool_)
     allowance = float(limits.max_disagreement_px), SLACK_PX
     kernels.reach(
-        rays, coordinate_px, AXES.index(direction), geometry(rig), range_m(rig), allowance, reached
+        rays, coordinate_px, AXES.index(direction), geometry(rig), rig.range_m, allowance, reached
     )
     return reached

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from fpp_ml_bench.coding.code import MAX_DISAGREEMENT_PX, Coordinates, Limits, Reason
 from fpp_ml_bench.coding.gray_code import binary_to_gray, cell_count, cell_of
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.decoding import blocks
 from fpp_ml_bench.decoding.blocks import CodePlan
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm, geometry
 from fpp_ml_bench.optics.pinhole import Maps
@@ -44,11 +43,9 @@ def reach_of(rig: Rig) -> NDArray[np.float64]:
     rows = np.linspace(0, rig.camera.height - 1, _GRID).round().astype(int)
     columns = np.linspace(0, rig.camera.width - 1, _GRID).round().astype(int)
     x, y = (axis[np.ix_(rows, columns)].ravel() for axis in rig.camera.rays())
-    near_m, far_m = blocks.range_m(rig)
+    near_m, far_m = rig.range_m
     background_m = far_m if rig.background_m is None else rig.background_m
-    return np.array(
-        [blocks.projected((x, y), depth_m, rig) for depth_m in (near_m, far_m, background_m)]
-    )
+    return np.array([rig.seen((x, y), depth_m) for depth_m in (near_m, far_m, background_m)])
 
 
 @lru_cache(maxsize=16)
@@ -111,12 +108,7 @@ def orders_from_phases(rig: Rig) -> JointCode:
     )
     if rig.projector.is_distorted or not usable.any():
         return JointCode(0.0, 0.0)
-    near, far, background, line = (
-        near[:, usable],
-        far[:, usable],
-        background[:, usable],
-        line[:, usable],
-    )
+    near, far, background, line = (part[:, usable] for part in (near, far, background, line))
     e = line / np.hypot(*line)
     pitch = np.array([[rig.pitch(direction)] for direction in AXES])
     span = (np.abs(line) + 2 * MAX_DISAGREEMENT_PX) / pitch
@@ -209,7 +201,7 @@ def nearest_pair(
     orders = {AXES[a]: order_a, AXES[b]: order_b}
     results, search = (order_a, order_b, nearest), (tolerance_px, tries)
     kernels.joint_orders(
-        rays, (first, second), a, geometry(rig), blocks.range_m(rig), pitches, search, results
+        rays, (first, second), a, geometry(rig), rig.range_m, pitches, search, results
     )
     return orders, nearest
 

@@ -309,7 +309,7 @@ def _shares(
         code, modulation = rig.code(direction), measured.modulation[valid]
         fewer, systematic_px = 1.0, 0.0
         if isinstance(code, PhaseShift):
-            fewer = 1.0 if steps is None else steps / len(code.fringes[0].shifts_deg)
+            fewer = 1.0 if steps is None else steps / code.fringes[0].steps
             rad = (
                 systematic_rad
                 if isinstance(systematic_rad, float)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.gray_code import bits_needed
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.design.search import Assumptions, Candidate, search
+from fpp_ml_bench.design.search import Assumptions, search
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG
 from fpp_ml_bench.optics.pinhole import Pinhole
@@ -62,7 +62,7 @@ def drawn_rig(random: np.random.Generator) -> Rig:
 
 def broken_rule(rig: Rig) -> str | None:
     """What a lab would change about ``rig`` before it looks at codes; None for nothing."""
-    near_m, far_m = (end / MM_PER_M for end in rig.working_range_mm)
+    near_m, far_m = rig.range_m
     for depth_m, least in (
         (rig.standoff_m, LEAST_COVERAGE),
         (near_m, LEAST_END_COVERAGE),
@@ -87,12 +87,8 @@ def broken_rule(rig: Rig) -> str | None:
 
 def coverage(rig: Rig, depth_m: float) -> float:
     """Share of the camera's pixels that see the pattern on a plane square to its axis."""
-    width, height = rig.camera.width, rig.camera.height
-    columns, rows = np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID))
-    x, y = rig.camera.normalised(columns.ravel(), rows.ravel())
-    u, v = rig.project(depth_m * np.column_stack([x, y, np.ones_like(x)]))
-    seen = (u >= 0) & (u <= rig.projector.width - 1) & (v >= 0) & (v <= rig.projector.height - 1)
-    return float(seen.mean())
+    u, v = rig.seen(rig.camera.grid(_GRID), depth_m)
+    return float(rig.projector.holds(u, v, 0.5).mean())
 
 
 def axes_deg(rig: Rig) -> float:
@@ -184,16 +180,10 @@ def _coded(rig: Rig) -> Rig | None:
         rig.check_sampling()
     except RigError:
         return None
-    if not _good(rig, candidate):
+    most_mm = MOST_EXPECTED_SHARE * rig.standoff_m * MM_PER_M
+    if candidate.wrong_share > MOST_WRONG_SHARE or candidate.expected_mm > most_mm:
         return None
     proposed = candidate.crossed
     return rig.with_crossed(
         Crossed(proposed.pitches_px, proposed.angles_deg, shifts_deg=FIRST_SHIFTED_DEG)
-    )
-
-
-def _good(rig: Rig, candidate: Candidate) -> bool:
-    return (
-        candidate.wrong_share <= MOST_WRONG_SHARE
-        and candidate.expected_mm <= MOST_EXPECTED_SHARE * rig.standoff_m * MM_PER_M
     )

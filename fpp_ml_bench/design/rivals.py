@@ -57,19 +57,15 @@ class EpipolarLines:
             np.append(np.tile(columns, GRID), (width - 1) / 2),
             np.append(np.repeat(rows, GRID), (height - 1) / 2),
         )
-        x, y = rig.camera.normalised(u, v)
-        rays = np.column_stack([x, y, np.ones_like(x)])
-        near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+        rays = rig.camera.normalised(u, v)
+        near_m, far_m = rig.range_m
         depths = [near_m, far_m, rig.standoff_m, far_m - _STEP_M, far_m + _STEP_M]
         depths += [] if rig.background_m is None else [rig.background_m]
         near, far, middle, before, behind, *beyond = (
-            np.stack(rig.project(rays * depth), axis=1) for depth in depths
+            np.stack(rig.seen(rays, depth), axis=1) for depth in depths
         )
         seen = np.isfinite(near).all(axis=1) & np.isfinite(far).all(axis=1)
-        inside = (middle >= -0.5) & (
-            middle <= np.array([rig.projector.width, rig.projector.height]) - 0.5
-        )
-        seen &= inside.all(axis=1)
+        seen &= rig.projector.holds(*middle.T)
         if not seen.any():
             raise RigError(
                 "no pixel sees the pattern over the whole working range: check pose and range"

@@ -195,14 +195,13 @@ class Pattern:
     causes: tuple[str, ...]
 
 
-def epipolar_pattern(
-    lines: Lines, rig: Rig, measured: Mapping[Direction, Coordinates]
-) -> Pattern | None:
+def epipolar_pattern(lines: Lines, measured: Mapping[Direction, Coordinates]) -> Pattern | None:
     """The pattern of pixels ``measured`` in both directions; None where there are too few, or noise
     explains it."""
     good = np.logical_and.reduce([coordinates.reason == 0 for coordinates in measured.values()])
     if len(measured) < 2 or good.sum() < LEAST_PX:
         return None
+    rig = lines.rig
     rays = tuple(axis[lines.row[good], lines.column[good]] for axis in rig.camera.rays())
     projector = rig.projector.normalised(
         *(measured[direction].coordinate_px[good] for direction in AXES)

@@ -3,6 +3,7 @@ frames and rig tell."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -120,20 +121,22 @@ def examine(
     if not directions:
         return Examination((), ("anything: no direction is coded pixel by pixel",))
     titles = [frame.title for frame in rig.sequence] if names is None else list(names)
-    lines, full_grey = marked_saturated(take_lines(frames, mask), rig, directions)
-    not_checked = _not_checked(rig, directions, calibrated)
+    taken = replace(
+        take_lines(frames, rig, mask), directions=directions, limits=limits, calibrated=calibrated
+    )
+    lines, full_grey = marked_saturated(taken)
+    not_checked = _not_checked(lines)
     if lines.lit.sum() < LEAST_PX:
         return Examination(
             (), (*not_checked, f"anything: only {lines.lit.sum()} pixels looked at are lit")
         )
-    sets = fringe_sets(lines, rig, directions)
-    pairs = equal_frames(lines, sets, rig, directions)
+    sets = fringe_sets(lines)
+    pairs = equal_frames(lines, sets)
     if pairs:
         return Examination((_equal(pairs, titles),), not_checked)
-    shape = (frames.shape[1], frames.shape[2])
     findings: list[Finding] = []
     part = lines.part(_SCORED_PX)
-    given = fit(part, rig, directions, limits, AS_GIVEN, calibrated)
+    given = fit(part, AS_GIVEN)
     measured = {
         "coherent_share": given.coherent,
         "in_range_share": given.fitting,
@@ -141,14 +144,14 @@ def examine(
     }
     systematic: dict[str, float] = {}
     for fringe_set in sets:
-        findings += _steps_and_response(lines, fringe_set, rig, titles, measured, systematic)
+        findings += _steps_and_response(lines, fringe_set, titles, measured, systematic)
     for fringe_set in sets:
-        if (edges := gray_edges(lines, fringe_set, rig, limits)) is None:
+        if (edges := gray_edges(lines, fringe_set)) is None:
             continue
         measured[f"{fringe_set.direction}_offset_turns"] = edges.offset_turns.value
         # A frame that is late shifts all phases, too.
         if _is_offset(edges) and not any(finding.severity == "refuse" for finding in findings):
-            torn = _torn(lines, sets, shape, rig, directions, limits, titles)
+            torn = _torn(lines, sets, titles)
             return Examination(
                 tuple(torn) or (_offset(edges, rig, fringe_set.direction),), not_checked, measured
             )
@@ -156,17 +159,13 @@ def examine(
         given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.coherent < TRIED
     )
     doubtful = doubtful or given.fitting < IN_RANGE * given.coherent
-    if doubtful and (other := search(lines, rig, directions, limits, given, calibrated)):
+    if doubtful and (other := search(lines, given)):
         return Examination((_another_reading(other, given),), not_checked, measured)
-    if torn := _torn(lines, sets, shape, rig, directions, limits, titles):
+    if torn := _torn(lines, sets, titles):
         return Examination(tuple(torn), not_checked, measured)
-    findings += _exchanged_flat(lines, rig) or _moved(sets)
-    pattern = (
-        epipolar_pattern(part, rig, decoded_lines(part, rig, directions, limits))
-        if calibrated
-        else None
-    )
-    where = _contradicting_bands(part, given, shape)
+    findings += _exchanged_flat(lines) or _moved(sets)
+    pattern = epipolar_pattern(part, decoded_lines(part)) if calibrated else None
+    where = _contradicting_bands(part, given)
     if pattern is not None:
         findings.append(_misaligned(pattern, rig))
         for direction in directions:
@@ -187,27 +186,27 @@ def examine(
     return Examination(tuple(findings), not_checked, measured, systematic, full_grey)
 
 
-def _not_checked(rig: Rig, directions: Sequence[Direction], calibrated: bool) -> tuple[str, ...]:
+def _not_checked(lines: Lines) -> tuple[str, ...]:
     """What frames of such a rig can't tell, whatever they show."""
     parts = []
-    if len(directions) < 2:
+    if len(lines.directions) < 2:
         parts.append(
             "images mirrored along the fringes, an inverted pose, another window of a sensor, and "
             "a camera or "
             "projector that moved, turned or zoomed since its calibration: one direction of "
             "fringes can't tell"
         )
-    for way in directions:
-        code = rig.code(way)
+    for way in lines.directions:
+        code = lines.rig.code(way)
         if isinstance(code, PhaseShift):
             if code.gray is None:
                 parts.append(
                     f"an offset of the {way} phases by whole fringes, or of all alike: no Gray "
                     f"code tells"
                 )
-            if max(len(fringe.shifts_deg) for fringe in code.fringes) == 3:
+            if max(fringe.steps for fringe in code.fringes) == 3:
                 parts.append(f"noise of the {way} frames: three steps fit any three grey levels")
-    if not calibrated:
+    if not lines.calibrated:
         parts.append("depth: the rig is not calibrated yet")
     return tuple(parts)
 
@@ -226,8 +225,9 @@ def _equal(pairs: Sequence[tuple[int, int]], titles: Sequence[str]) -> Finding:
     )
 
 
-def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
-    black, white = rig.sequence.black, rig.sequence.white
+def _exchanged_flat(lines: Lines) -> list[Finding]:
+    sequence = lines.rig.sequence
+    black, white = sequence.black, sequence.white
     if black is None or white is None:
         return []
     dark, bright = (
@@ -299,7 +299,6 @@ def _another_reading(readings: Sequence[tuple[Reading, Fit]], given: Fit) -> Fin
 def _steps_and_response(
     lines: Lines,
     fringe_set: FringeSet,
-    rig: Rig,
     titles: Sequence[str],
     measured: dict[str, float],
     systematic: dict[str, float],
@@ -307,7 +306,7 @@ def _steps_and_response(
     """A step that is not what it should be, and the response, which is no fault of the capture."""
     waves = (
         ripples(lines, fringe_set)
-        if fringe_set.pitch_px <= _FINEST * rig.pitch(fringe_set.direction)
+        if fringe_set.pitch_px <= _FINEST * lines.rig.pitch(fringe_set.direction)
         else {}
     )
     name, faults = f"{fringe_set.direction} fringes of {fringe_set.pitch_px:g} px", []
@@ -387,33 +386,20 @@ def _moved(sets: Sequence[FringeSet], torn: NDArray[np.bool_] | None = None) -> 
     return []
 
 
-def _torn(
-    lines: Lines,
-    sets: Sequence[FringeSet],
-    shape: tuple[int, int],
-    rig: Rig,
-    directions: Sequence[Direction],
-    limits: Limits,
-    titles: Sequence[str],
-) -> list[Finding]:
+def _torn(lines: Lines, sets: Sequence[FringeSet], titles: Sequence[str]) -> list[Finding]:
     """Frames of which some rows or columns show another pattern than the rest; or, where the rest
     of the image differs between the ``sets`` as well, a scene that moved: two scenes in one capture
     make lines look torn here and there."""
     torn: dict[Side, dict[Band, list[str]]] = {"rows": {}, "columns": {}}
     sizes: dict[tuple[Side, str, float], dict[Band, Estimate]] = {}
-    for band, inside in lines.banded(shape):
+    for band, inside in lines.banded():
         if np.count_nonzero(inside & lines.lit) < LEAST_PX:
             continue
         part = lines.at(np.flatnonzero(inside))
-        of_band = fringe_sets(part, rig, directions)
-        for i, j in equal_frames(
-            part,
-            [fringe_set for fringe_set in of_band if not fringe_set.one_phase],
-            rig,
-            directions,
-            True,
-        ):
-            if not _never_alike(part, rig, band.side, i, j):
+        of_band = fringe_sets(part)
+        crossed = [fringe_set for fringe_set in of_band if not fringe_set.one_phase]
+        for i, j in equal_frames(part, crossed, following=True):
+            if not _never_alike(part, band.side, i, j):
                 continue
             torn[band.side].setdefault(band, []).append(
                 f"{titles[j]} shows the image of {titles[i]}"
@@ -424,7 +410,7 @@ def _torn(
                 sizes.setdefault((band.side, f"a step of {name} is wrong", STEP_RAD), {})[band] = (
                     step[1]
                 )
-            edges = gray_edges(part, fringe_set, rig, limits)
+            edges = gray_edges(part, fringe_set)
             if edges is not None and edges.clear:
                 fault = f"{name} are shifted against the Gray code"
                 sizes.setdefault((band.side, fault, OFFSET_TURNS), {})[band] = edges.offset_turns
@@ -468,10 +454,11 @@ def _torn(
     ]
 
 
-def _never_alike(part: Lines, rig: Rig, side: Side, i: int, j: int) -> bool:
+def _never_alike(part: Lines, side: Side, i: int, j: int) -> bool:
     """Whether two frames that follow one another can't look alike in a band of such a ``side``,
     unless one is torn."""
-    first, second = rig.sequence.frames[i], rig.sequence.frames[j]
+    sequence = part.rig.sequence
+    first, second = sequence.frames[i], sequence.frames[j]
     along = all(ALONG.get(frame.direction, side) == side for frame in (first, second))
     of_one_set = (first.kind, first.direction, first.fringe) == (
         second.kind,
@@ -481,7 +468,7 @@ def _never_alike(part: Lines, rig: Rig, side: Side, i: int, j: int) -> bool:
     if of_one_set and first.kind == "sinusoid" and first.direction is not None:
         # Steps near each other differ little, and with many of them a torn one is a wrong step
         # anyway.
-        return along or len(rig.sequence.period(first.direction, first.fringe)) <= MOST_UNLIKE_STEPS
+        return along or len(sequence.period(first.direction, first.fringe)) <= MOST_UNLIKE_STEPS
     its_inverse = of_one_set and first.step == second.step
     return along or its_inverse or turns(part, j) >= FEWEST_TURNS
 
@@ -497,14 +484,14 @@ def _ranges(bands: Sequence[Band]) -> str:
     return f"{bands[0].side} " + ", ".join(f"{first} to {last}" for first, last in ends)
 
 
-def _contradicting_bands(part: Lines, given: Fit, shape: tuple[int, int]) -> str:
+def _contradicting_bands(part: Lines, given: Fit) -> str:
     """The rows or columns in which far more of the lit pixels contradict the code than in others,
     in words; "" where none do. They reach an end of the image, as those do that were read too late;
     what a scene does may be anywhere."""
     if given.lit is None or given.against is None:
         return ""
     shares: dict[Side, dict[Band, float]] = {"rows": {}, "columns": {}}
-    for band, inside in part.banded(shape):
+    for band, inside in part.banded():
         lit = inside & given.lit
         if np.count_nonzero(lit) >= FEWEST_IN_BAND:
             shares[band.side][band] = float(given.against[lit].mean())

@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding.code import Coordinates, Limits, Reason
+from fpp_ml_bench.coding.code import Coordinates, Reason
 from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding.blocks import depth_and_reason, plan_direction
 from fpp_ml_bench.examination.signals import Lines, fringe_sets, gray_edges
+from fpp_ml_bench.optics.pinhole import Maps
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES, Direction, Frame
 
@@ -56,41 +57,42 @@ _WIDE_MM = (1e-6, 1e12)
 all."""
 
 
-Change = Callable[[Lines, Rig], tuple[Lines, Rig]]
+Change = Callable[[Lines], Lines]
 
 
 @dataclass(frozen=True)
 class Reading:
     """A way to read the images: ``what`` is different from the rig file, the ``change`` to do, and
-    ``seen``, which gives the lines and the rig as this reading has them."""
+    ``seen``, which gives the lines as this reading has them."""
 
     what: str
     change: str
-    seen: Change = lambda lines, rig: (lines, rig)
+    seen: Change = lambda lines: lines
 
 
 def _in_order(place: Sequence[int]) -> Change:
     """Frames of the sequence at other places of the capture, ``place[index]`` for each of them."""
-    return lambda lines, rig: (replace(lines, levels=lines.levels[list(place)]), rig)
+    return lambda lines: replace(lines, levels=lines.levels[list(place)])
 
 
 def _with_levels(change: Callable[[NDArray], NDArray]) -> Change:
-    return lambda lines, rig: (replace(lines, levels=change(lines.levels)), rig)
+    return lambda lines: replace(lines, levels=change(lines.levels))
 
 
 def _flipped(across: bool, down: bool) -> Change:
-    def seen(lines: Lines, rig: Rig) -> tuple[Lines, Rig]:
-        column = rig.camera.width - 1 - lines.column if across else lines.column
-        return replace(
-            lines, column=column, row=rig.camera.height - 1 - lines.row if down else lines.row
-        ), rig
+    def seen(lines: Lines) -> Lines:
+        height, width = lines.shape
+        column = width - 1 - lines.column if across else lines.column
+        return replace(lines, column=column, row=height - 1 - lines.row if down else lines.row)
 
     return seen
 
 
-def _inverse_pose(lines: Lines, rig: Rig) -> tuple[Lines, Rig]:
+def _inverse_pose(lines: Lines) -> Lines:
+    rig = lines.rig
     turned: Any = tuple(tuple(column) for column in rig.R.T.tolist())
-    return lines, replace(rig, rotation=turned, translation_m=tuple((-rig.R.T @ rig.t).tolist()))
+    shift: Any = tuple((-rig.R.T @ rig.t).tolist())
+    return replace(lines, rig=replace(rig, rotation=turned, translation_m=shift))
 
 
 @dataclass(frozen=True)
@@ -112,30 +114,22 @@ class Fit:
 AS_GIVEN = Reading("as the rig file says", "")
 
 
-def decoded_lines(
-    lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits
-) -> dict[Direction, Coordinates]:
+def decoded_lines(lines: Lines) -> dict[Direction, Coordinates]:
     """The projector's coordinates of the lines' pixels."""
-    plans = [plan_direction(rig, direction, None) for direction in directions]
+    plans = [plan_direction(lines.rig, direction, None) for direction in lines.directions]
     return {
-        plan.direction: plan.decode(np.ascontiguousarray(lines.levels[list(plan.rows)]), limits)
+        plan.direction: plan.decode(
+            np.ascontiguousarray(lines.levels[list(plan.rows)]), lines.limits
+        )
         for plan in plans
     }
 
 
-def fit(
-    lines: Lines,
-    rig: Rig,
-    directions: Sequence[Direction],
-    limits: Limits,
-    reading: Reading,
-    solid: bool,
-) -> Fit:
-    """How well the reading fits; without ``solid`` (a rig that is not calibrated) depth and order
-    don't count."""
-    lines, rig = reading.seen(lines, rig)
-    levels = lines.levels
-    measured, edges = decoded_lines(lines, rig, directions, limits), 1.0
+def fit(lines: Lines, reading: Reading) -> Fit:
+    """How well the reading fits; of a rig that is not calibrated depth and order don't count."""
+    lines = reading.seen(lines)
+    rig, directions, levels = lines.rig, lines.directions, lines.levels
+    measured, edges = decoded_lines(lines), 1.0
     reasons = np.stack([coordinates.reason for coordinates in measured.values()])
     reason = np.where(reasons == 0, np.uint8(Reason.NOT_ASKED), reasons).min(axis=0)
     reason[reason == Reason.NOT_ASKED] = 0
@@ -144,7 +138,7 @@ def fit(
     # Gray code alone has no second opinion: a doubtful bit there is blur.
     alone = all(isinstance(rig.code(way), GrayOnly) for way in directions)
     contradicting = lit & (reason != 0) & ~(alone & (reason == Reason.INCONSISTENT_ORDER))
-    for fringe_set in fringe_sets(lines, rig, directions):
+    for fringe_set in fringe_sets(lines):
         if fringe_set.steps > 3:
             shown = fringe_set.mean + fringe_set.modulation * np.cos(
                 fringe_set.phase + fringe_set.shifts_rad[:, None]
@@ -153,7 +147,7 @@ def fit(
             reason[(reason == 0) & (misfit > (LARGEST_MISFIT * fringe_set.modulation) ** 2)] = (
                 Reason.INCONSISTENT_ORDER
             )
-        cell_edges = gray_edges(lines, fringe_set, rig, limits)
+        cell_edges = gray_edges(lines, fringe_set)
         edges *= (
             1.0
             if cell_edges is None or cell_edges.edges < _FEWEST_PAIRS
@@ -163,26 +157,25 @@ def fit(
     counted = (lit | (np.ptp(levels, axis=0) >= CLEARLY_LIT_GREY)) & ~saturated
     if not counted.any():
         return Fit()
-    if not solid:
+    if not lines.calibrated:
         share = edges * float((reason[counted] == 0).mean())
         return Fit(
             share, share, float(contradicting.sum()) / bright, edges, None, lit, contradicting
         )
-    rays = tuple(axis[lines.row, lines.column] for axis in rig.camera.rays())
+    x, y = (axis[lines.row, lines.column] for axis in rig.camera.rays())
     forward = min(
         (
-            _forward(lines, rays, measured[way].coordinate_px, reason == 0, rig, way)
+            _forward(lines, (x, y), measured[way].coordinate_px, reason == 0, way)
             for way in directions
         ),
         default=1.0,
     )
     apart_px = LARGEST_DISAGREEMENT_PX + math.hypot(*(rig.code(way).step_px for way in directions))
-    wide, loose = rig.with_range(_WIDE_MM), replace(limits, max_disagreement_px=apart_px)
-    depth_mm, of_depth = depth_and_reason(measured, (rays[0], rays[1]), wide, loose)
+    wide, loose = rig.with_range(_WIDE_MM), replace(lines.limits, max_disagreement_px=apart_px)
+    depth_mm, of_depth = depth_and_reason(measured, (x, y), wide, loose)
     good = (reason == 0) & (of_depth == 0)
     contradicting |= lit & (reason == 0) & (of_depth != 0)
-    near, far = rig.working_range_mm
-    inside = (depth_mm >= near) & (depth_mm <= far)
+    inside = rig.in_range(depth_mm)
     if rig.background_m is not None:
         inside |= (
             np.abs(depth_mm - rig.background_m * MM_PER_M)
@@ -196,19 +189,17 @@ def fit(
 
 def _forward(
     lines: Lines,
-    rays: Sequence[NDArray],
+    rays: Maps,
     coordinate_px: NDArray,
     known: NDArray[np.bool_],
-    rig: Rig,
     direction: Direction,
 ) -> float:
     """Share of neighbours between which the coordinate grows as it does on a plane in the middle of
     the range."""
+    rig = lines.rig
     middle_m = sum(rig.working_range_mm) / 2 / MM_PER_M
-    points = np.stack(
-        [rays[0] * middle_m, rays[1] * middle_m, np.full_like(rays[0], middle_m)], axis=-1
-    )
-    on_plane, change = np.diff(rig.project(points)[AXES.index(direction)]), np.diff(coordinate_px)
+    on_plane = np.diff(rig.seen(rays, middle_m)[AXES.index(direction)])
+    change = np.diff(coordinate_px)
     with np.errstate(invalid="ignore"):
         used = lines.joined[:-1] & known[:-1] & known[1:] & (change != 0) & np.isfinite(on_plane)
         if used.sum() < _FEWEST_PAIRS:
@@ -220,20 +211,13 @@ def _forward(
     return float((near & (np.sign(change[used]) == np.sign(on_plane[used]))).mean())
 
 
-def search(
-    lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, given: Fit, solid: bool
-) -> list[tuple[Reading, Fit]]:
+def search(lines: Lines, given: Fit) -> list[tuple[Reading, Fit]]:
     """The readings that fit far better than the one ``given``, best first; none where none does."""
     few, more = lines.part(_FIRST_PX), lines.part(_SECOND_PX)
-    for candidates in (_single(rig, solid), _exchanges(rig)):
-        first = [
-            (reading, fit(few, rig, directions, limits, reading, solid)) for reading in candidates
-        ]
+    for candidates in (_single(lines.rig, lines.calibrated), _exchanges(lines.rig)):
+        first = [(reading, fit(few, reading)) for reading in candidates]
         first.sort(key=lambda pair: -pair[1].fitting)
-        second = [
-            (reading, fit(more, rig, directions, limits, reading, solid))
-            for reading, _ in first[:_KEPT]
-        ]
+        second = [(reading, fit(more, reading)) for reading, _ in first[:_KEPT]]
         needed = max(GOOD, 1 - (1 - given.fitting) / FEWER)
         named = sorted(
             (pair for pair in second if pair[1].fitting >= needed),

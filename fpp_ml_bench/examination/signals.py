@@ -11,7 +11,7 @@ neighbours can't have in common with the scene: a surface is smooth within a few
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from typing import Literal, NamedTuple
 
@@ -84,7 +84,9 @@ Side = Literal["rows", "columns"]
 class Lines:
     """``levels`` (F, n) of n pixels at ``column`` and ``row``, line after line. ``joined``: the
     next pixel is the neighbour on the same line; ``across``: the line is a row; ``lit`` pixels
-    change from frame to frame."""
+    change from frame to frame. They are of images of ``shape`` (H, W) by ``rig``, of which the
+    ``directions`` are looked at, and decoded within ``limits``; ``calibrated`` False: lenses, pose
+    and range of the rig are placeholders."""
 
     levels: NDArray
     column: NDArray[np.intp]
@@ -92,6 +94,11 @@ class Lines:
     joined: NDArray[np.bool_]
     across: NDArray[np.bool_]
     lit: NDArray[np.bool_]
+    shape: tuple[int, int]
+    rig: Rig
+    directions: tuple[Direction, ...] = ()
+    limits: Limits = field(default_factory=Limits)
+    calibrated: bool = True
 
     def part(self, most_px: int) -> "Lines":
         """The lit pixels of some of the lines, ``most_px`` and up to a line more."""
@@ -104,24 +111,24 @@ class Lines:
 
     def at(self, picked: NDArray[np.intp]) -> "Lines":
         """The pixels at the ascending indices ``picked``."""
-        joined = self.joined[picked] & np.append(np.diff(picked) == 1, False)
-        others = (
-            self.column[picked],
-            self.row[picked],
-            joined,
-            self.across[picked],
-            self.lit[picked],
+        return replace(
+            self,
+            levels=self.levels[:, picked],
+            column=self.column[picked],
+            row=self.row[picked],
+            joined=self.joined[picked] & np.append(np.diff(picked) == 1, False),
+            across=self.across[picked],
+            lit=self.lit[picked],
         )
-        return Lines(self.levels[:, picked], *others)
 
-    def banded(self, shape: tuple[int, int]) -> Iterator[tuple["Band", NDArray[np.bool_]]]:
-        """The bands of an image of ``shape`` (H, W), of rows and then of columns, and which pixels
-        (n,) lie in each."""
+    def banded(self) -> Iterator[tuple["Band", NDArray[np.bool_]]]:
+        """The bands of the image, of rows and then of columns, and which pixels (n,) lie in
+        each."""
         sides: tuple[tuple[Side, NDArray[np.intp]], ...] = (
             ("rows", self.row),
             ("columns", self.column),
         )
-        for (side, position), length in zip(sides, shape, strict=True):
+        for (side, position), length in zip(sides, self.shape, strict=True):
             number = position * BANDS // length
             for band in range(BANDS):
                 first, end = (-(-count * length // BANDS) for count in (band, band + 1))
@@ -141,7 +148,7 @@ def _thinned(pixels: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(pixels)[:: max(1, int(pixels.sum() // _EQUAL_PX))]
 
 
-def take_lines(stack: NDArray, mask: NDArray[np.bool_] | None = None) -> Lines:
+def take_lines(stack: NDArray, rig: Rig, mask: NDArray[np.bool_] | None = None) -> Lines:
     """The lines of frames, ``stack`` (F, H, W), that hold the most lit pixels, evenly spread; those
     in ``mask`` alone count."""
     height, width = stack.shape[1:]
@@ -155,13 +162,16 @@ def take_lines(stack: NDArray, mask: NDArray[np.bool_] | None = None) -> Lines:
         cumulated = np.cumsum(counts) / max(counts.sum(), 1)
         spread = np.searchsorted(cumulated, (np.arange(count) + 0.5) / count)
         chosen.append(np.unique(spread.clip(0, len(counts) - 1)) * step)
-    lines = lines_at(stack, *chosen)
+    lines = lines_at(stack, rig, *chosen)
     lit = np.ptp(lines.levels, axis=0) >= LEAST_LIT_GREY
     return replace(lines, lit=lit if mask is None else lit & mask[lines.row, lines.column])
 
 
 def lines_at(
-    frames: Sequence[NDArray] | NDArray, rows: NDArray[np.intp], columns: NDArray[np.intp]
+    frames: Sequence[NDArray] | NDArray,
+    rig: Rig,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
 ) -> Lines:
     """These rows, then these columns of ``frames`` (F, H, W); all pixels count as lit."""
     height, width = frames[0].shape
@@ -176,6 +186,8 @@ def lines_at(
         ~last,
         across,
         np.ones(len(row), bool),
+        (height, width),
+        rig,
     )
 
 
@@ -219,13 +231,13 @@ class FringeSet:
         )
 
 
-def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list[FringeSet]:
+def fringe_sets(lines: Lines) -> list[FringeSet]:
     """The sets of three and more steps, with what the lines show of them."""
     sets = []
-    for direction in directions:
-        code = rig.code(direction)
+    for direction in lines.directions:
+        code = lines.rig.code(direction)
         for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
-            frames = rig.sequence.period(direction, number)
+            frames = lines.rig.sequence.period(direction, number)
             if len(frames) < 3:
                 continue
             shifts, levels = TAU * fringe.turns, lines.levels[list(frames)]
@@ -249,11 +261,7 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
 
 
 def equal_frames(
-    lines: Lines,
-    sets: Sequence[FringeSet],
-    rig: Rig,
-    directions: Sequence[Direction],
-    following: bool = False,
+    lines: Lines, sets: Sequence[FringeSet], following: bool = False
 ) -> list[tuple[int, int]]:
     """Pairs of frames that should differ and show the same, but for noise and a few percent of
     brightness: within a set (``following``: only if they follow one another), and one after the
@@ -281,8 +289,8 @@ def equal_frames(
     bright, dark = ((sign * from_middle > CLEAR_LEVELS * span).mean(axis=1) for sign in (1, -1))
     coded = [
         frame.index
-        for frame in rig.sequence
-        if frame.direction is None or frame.direction in directions
+        for frame in lines.rig.sequence
+        if frame.direction is None or frame.direction in lines.directions
     ]
     for i, j in pairwise(coded):
         same_set = any({i, j} <= set(fringe_set.frames) for fringe_set in sets)
@@ -461,15 +469,11 @@ def _wrapped(angle: NDArray) -> NDArray[np.float64]:
     return angle - TAU * np.rint(angle / TAU)
 
 
-def marked_saturated(
-    lines: Lines, rig: Rig, directions: Sequence[Direction]
-) -> tuple[Lines, float]:
+def marked_saturated(lines: Lines) -> tuple[Lines, float]:
     """The lines with their saturated levels at `GREY_LEVELS`, and the level at which they are
     saturated: below that where the levels of sinusoids pile up there, as in a sum of saturated
     exposures."""
-    sinusoids = [
-        index for fringe_set in fringe_sets(lines, rig, directions) for index in fringe_set.frames
-    ]
+    sinusoids = [index for fringe_set in fringe_sets(lines) for index in fringe_set.frames]
     levels = lines.levels[sinusoids][:, lines.lit]
     top = levels.max() if levels.size else GREY_LEVELS
     near = levels > top - PILE_DEPTH * (top - levels.min()) if levels.size else levels
@@ -501,18 +505,16 @@ class Edges(NamedTuple):
         return self.agreeing > 0.8 and self.forward > 0.8
 
 
-def gray_edges(lines: Lines, fringe_set: FringeSet, rig: Rig, limits: Limits) -> Edges | None:
+def gray_edges(lines: Lines, fringe_set: FringeSet) -> Edges | None:
     """What the edges of the Gray cells say about the phase of the set; None without Gray code or
     with few edges."""
-    code = rig.code(fringe_set.direction)
+    rig, direction = lines.rig, fringe_set.direction
+    code = rig.code(direction)
     if not isinstance(code, PhaseShift) or code.gray is None or fringe_set.number != code.finest:
         return None
-    length, levels = (
-        rig.pattern_length(fringe_set.direction),
-        lines.levels[list(rig.sequence.gray(fringe_set.direction))],
-    )
+    length, levels = rig.pattern_length(direction), lines.levels[list(rig.sequence.gray(direction))]
     cells = code.gray.cells_of(
-        levels, fringe_set.mean, fringe_set.modulation, limits.ambiguous_fraction
+        levels, fringe_set.mean, fringe_set.modulation, lines.limits.ambiguous_fraction
     )
     usable = fringe_set.good & cells.trusted
     first = np.flatnonzero(usable[:-1] & usable[1:] & lines.joined[:-1])

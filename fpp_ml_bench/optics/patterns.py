@@ -9,7 +9,6 @@ the pixels with floor(w / (P / 2)) = j, in reflected binary code, most significa
 
 from collections.abc import Iterable
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +16,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.coding.code import Code
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.containers import png_bytes
-from fpp_ml_bench.errors import FppBenchError, RigError
-from fpp_ml_bench.files import write_files
+from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.rig import Rig
 
 
@@ -90,9 +88,3 @@ def pattern_files(rig: Rig) -> dict[str, bytes]:
         f"A_{index:0{digits}}.png": png_bytes(pattern_image(rig, index))
         for index in range(len(rig.sequence))
     }
-
-
-def export_patterns(rig: Rig, folder: str | Path) -> list[Path]:
-    """Write `pattern_files` into ``folder`` and return their paths in frame order; `FppBenchError`
-    where the folder can't be made or a file can't be written."""
-    return write_files(Path(folder), pattern_files(rig), FppBenchError)

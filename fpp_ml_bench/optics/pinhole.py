@@ -292,6 +292,20 @@ class Pinhole:
         maps are kept."""
         return _rays(self)
 
+    def holds(
+        self, u: NDArray[np.float64], v: NDArray[np.float64], inset_px: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Which pixels (u, v) lie on the image, so far from its border or farther; the outer pixels
+        are on it as a whole, and NaN is not. Bool of their shape."""
+        low, right, bottom = inset_px - 0.5, self.width - 0.5, self.height - 0.5
+        return (u >= low) & (u <= right - inset_px) & (v >= low) & (v <= bottom - inset_px)
+
+    def grid(self, count: int) -> Maps:
+        """Ideal normalised coordinates (x, y) of ``count`` times ``count`` pixels, evenly over the
+        image from corner to corner, (count, count) each."""
+        lengths = self.width, self.height
+        return self.normalised(*np.meshgrid(*(np.linspace(0, n - 1, count) for n in lengths)))
+
     def project(self, points_m: ArrayLike) -> Maps:
         """Pixels (u, v) of points (..., 3) in this device's frame, metres; NaN for points at or
         behind the centre."""

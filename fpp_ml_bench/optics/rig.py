@@ -239,6 +239,12 @@ class Rig:
         return math.sqrt(sum(t * t for t in self.translation_m))
 
     @property
+    def range_m(self) -> tuple[float, float]:
+        """The near and far end of the working range in m."""
+        near_mm, far_mm = self.working_range_mm
+        return near_mm / MM_PER_M, far_mm / MM_PER_M
+
+    @property
     def half_range_mm(self) -> float:
         """Half the depth of the working range: no surface in it is farther from its middle."""
         near_mm, far_mm = self.working_range_mm
@@ -293,6 +299,13 @@ class Rig:
         ]
         return self.projector.project(np.stack(turned, axis=-1))
 
+    def seen(self, rays: Maps, depth_m: ArrayLike) -> Maps:
+        """Projector pixels (u_p, v_p) of what the camera's ``rays``, normalised (x, y), see at
+        ``depth_m``, which broadcasts with them; NaN behind the projector."""
+        x, y = rays
+        depth = np.asarray(depth_m, dtype=np.float64)
+        return self.project(np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1))
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and mappings, as stored with a dataset; `rig_from_dict` gives an
         equal rig back."""
@@ -321,9 +334,7 @@ class Rig:
         centre = (self.camera.width - 1) / 2, (self.camera.height - 1) / 2
         axis = AXES.index(direction)
         pixel = [c + (shift_px if i == axis else 0.0) for i, c in enumerate(centre)]
-        x, y = self.camera.normalised(*pixel)
-        depth = np.atleast_1d(np.asarray(depth_m, dtype=np.float64))
-        seen = self.project(np.stack([x * depth, y * depth, depth], axis=-1))[axis]
+        seen = self.seen(self.camera.normalised(*pixel), np.atleast_1d(depth_m))[axis]
         unseen = (
             "the projector does not look at what the camera's central pixel sees: check rotation "
             "and signs"
@@ -342,16 +353,15 @@ class Rig:
     def periods_in_range(self, direction: Direction) -> float:
         """Fringe periods that the central camera pixel's ray crosses within the working range (2.4
         and 1.9 here)."""
-        near, far = self._central_coordinate(direction, np.array(self.working_range_mm) / MM_PER_M)
+        near, far = self._central_coordinate(direction, self.range_m)
         return abs(float(near - far)) / self.pitch(direction)
 
     @property
     def projector_px_per_mm(self) -> float:
         """Projector px by which the pattern's image of the central camera pixel moves for a mm of
         depth at the standoff: central difference over a thousandth of it."""
-        x, y = self.camera.normalised(self.camera.cx, self.camera.cy)
-        ends = self.standoff_m * np.array([[0.9995], [1.0005]])
-        u, v = self.project(ends * np.array([[float(x), float(y), 1.0]]))
+        ends = self.standoff_m * np.array([0.9995, 1.0005])
+        u, v = self.seen(self.camera.normalised(*self.camera.centre), ends)
         moved_px = math.hypot(float(u[1] - u[0]), float(v[1] - v[0]))
         return moved_px / (0.001 * self.standoff_m * MM_PER_M)
 
@@ -378,8 +388,7 @@ class Rig:
         pattern, at the image centre on a plane square to the axis at the standoff: a linear map."""
         shifts = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
         beside = np.array([self.camera.width - 1, self.camera.height - 1]) / 2 + shifts
-        x, y = self.camera.normalised(beside[:, 0], beside[:, 1])
-        u, v = self.project(self.standoff_m * np.column_stack([x, y, np.ones(4)]))
+        u, v = self.seen(self.camera.normalised(*beside.T), self.standoff_m)
         turns = cycles_per_px[0] * u + cycles_per_px[1] * v
         return float(turns[1] - turns[0]), float(turns[3] - turns[2])
 

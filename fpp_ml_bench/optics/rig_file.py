@@ -208,14 +208,8 @@ def _depth_share_of_px(rig: Rig) -> float:
     """Least change of depth, relative to the far end of the working range, that moves the coded
     projector coordinates by a px there; of rays all over the image, 0 where the projector looks at
     none of them."""
-    lengths = rig.camera.width, rig.camera.height
-    x, y = rig.camera.normalised(
-        *np.meshgrid(*(np.linspace(0, length - 1, 9) for length in lengths))
-    )
     ends = rig.working_range_mm[1] / MM_PER_M * np.array([0.99, 1.01])
-    seen = np.array(
-        [rig.project(np.stack([x * z, y * z, np.full_like(x, z)], axis=-1)) for z in ends]
-    )
+    seen = np.array([rig.seen(rig.camera.grid(9), depth_m) for depth_m in ends])
     moved_px = (seen[1] - seen[0])[
         [AXES.index(direction) for direction in rig.directions or DIRECTIONS]
     ]

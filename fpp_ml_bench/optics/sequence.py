@@ -98,9 +98,9 @@ class AnySequence(ABC):
         for direction in self.directions:
             code = self.code(direction)
             for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
-                steps = len(fringe.shifts_deg)
+                steps = fringe.steps
                 for sign in (1, -1):
-                    if steps >= 3 and fringe.shifts_deg == equal_shifts(steps, sign):
+                    if steps >= 3 and fringe.equal_steps(sign):
                         sets.append(
                             (self.period(direction, number), sign * np.arange(steps) / steps)
                         )

@@ -25,7 +25,7 @@ from fpp_ml_bench.calibration.projector_points import (
     measure_pose,
 )
 from fpp_ml_bench.calibration.result import Calibration
-from fpp_ml_bench.calibration.solve import raise_all
+from fpp_ml_bench.calibration.solve import FEWEST_POSES, raise_all
 from fpp_ml_bench.calibration.volume import Places, depth_spread
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
@@ -41,7 +41,7 @@ from fpp_ml_bench.decoding.triangulation import (
 from fpp_ml_bench.errors import CalibrationError, CaptureError, DecodeError
 from fpp_ml_bench.examination.examine import examine
 from fpp_ml_bench.examination.findings import Examination, Finding, RefusedCapture
-from fpp_ml_bench.files import file_content, visible
+from fpp_ml_bench.files import file_content, first_of, visible
 from fpp_ml_bench.loaders.captures.images import (
     LOSSLESS,
     LOSSY,
@@ -55,7 +55,7 @@ from fpp_ml_bench.loaders.captures.images import (
 )
 from fpp_ml_bench.loaders.published.importing import RowReader, import_plan
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage.assembly import Assembly
+from fpp_ml_bench.loaders.storage.assembly import Assembly, Progress
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_rows
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
@@ -79,7 +79,6 @@ CAUSES = {
 }
 """Why nothing is decoded, by the reason of most pixels."""
 JPEG_BLOCK_PX = 8
-FEWEST_POSES = 3
 RANGE_MARGIN = 0.1
 """A calibrated rig's working range is that of the boards' points, widened by this share of their
 distance."""
@@ -254,17 +253,12 @@ def _clipped(capture: CapturedFrames, lit: NDArray[np.bool_], full_grey: float) 
     high = [
         f"{name} ({100 * share:.0f}%)" for name, share in shares.items() if share > CLIPPED_SHARE
     ]
-    more = f" and {len(high) - 4} more" if len(high) > 4 else ""
     piled = (
         f", where levels pile up at {full_grey:.0f} of {GREY_LEVELS}"
         if full_grey < GREY_LEVELS
         else ""
     )
-    return (
-        [f"saturated on lit pixels{piled}: {', '.join(high[:4])}{more}; expose less"]
-        if high
-        else []
-    )
+    return [f"saturated on lit pixels{piled}: {first_of(high, 4)}; expose less"] if high else []
 
 
 def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -414,7 +408,7 @@ def captures_plan(
 
 def capture_notes(manifest: Manifest) -> list[str]:
     """Notes about a finished import for the user, a sentence each."""
-    rows = [row for part in manifest.samples.values() for row in part]
+    rows = manifest.rows
     notes = []
     if manifest.settings["splits"] != "given":
         notes.append("no --splits given: all objects are in split test")
@@ -456,7 +450,7 @@ def board_poses(
     sequence: Path,
     bits: int | None = None,
     colour: str | None = None,
-    progress: Callable[[int], None] = lambda poses: None,
+    progress: Progress = lambda poses: None,
     anyway: bool = False,
     examined: Callable[[str, Examination], None] = lambda name, examination: None,
 ) -> tuple[list[Pose], Rig, Response | None]:

@@ -21,7 +21,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.containers import matrix_bytes, pfm_bytes
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.examination.findings import Examination
-from fpp_ml_bench.files import LOCK_FILE, UNFINISHED, write_files
+from fpp_ml_bench.files import LOCK_FILE, UNFINISHED, first_of, write_files
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames
 from fpp_ml_bench.loaders.pictures import capture_picture
@@ -286,9 +286,9 @@ def check_outputs(folder: Path) -> list[Path]:
     )
     others = [path.name for path in paths if path.is_dir() or not _WRITTEN.fullmatch(path.name)]
     if others:
-        listed = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
         raise CaptureError(
-            f"{folder}: holds files that no decoding writes: {listed}; give a new folder"
+            f"{folder}: holds files that no decoding writes: {first_of(others, 4)}; give a new "
+            f"folder"
         )
     return paths
 

@@ -29,7 +29,7 @@ from fpp_ml_bench.coding.code import Limits
 from fpp_ml_bench.constants import OBJECT_NAME, VIEW_NAME
 from fpp_ml_bench.containers import LARGEST_BYTES
 from fpp_ml_bench.errors import CaptureError, RigError
-from fpp_ml_bench.files import file_content, printable, read_yaml
+from fpp_ml_bench.files import file_content, first_of, printable, read_yaml
 from fpp_ml_bench.loaders.captures.decoding import CaptureReader, captures_plan
 from fpp_ml_bench.loaders.captures.images import Capture, check_options
 from fpp_ml_bench.loaders.storage.assembly import Assembly
@@ -120,13 +120,12 @@ def plan_real(read: ReadSet, root: Path) -> Assembly[CaptureReader]:
             for (name, digest), path in zip(files.items(), paths, strict=True):
                 if not path.is_file():
                     missing.append(name)
-                elif _digest(path) != digest:
+                elif sha256(file_content(path, LARGEST_BYTES, CaptureError)).hexdigest() != digest:
                     different.append(name)
     if missing:
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise CaptureError(
             f"{root}: expected a copy of {content.source} at commit {content.commit}, and found no "
-            f"{', '.join(missing[:3])}{more}; get it by git clone {content.source}"
+            f"{first_of(missing, 3)}; get it by git clone {content.source}"
         )
     settings = {
         "layout": "real",
@@ -150,11 +149,6 @@ def plan_real(read: ReadSet, root: Path) -> Assembly[CaptureReader]:
     )
 
 
-def _digest(path: Path) -> str:
-    content = file_content(path, LARGEST_BYTES, CaptureError)
-    return sha256(content).hexdigest()
-
-
 def real_notes(read: ReadSet, settings: dict[str, Any]) -> list[str]:
     """What a user should know of an imported set, a sentence each."""
     content, different = read.content, settings["set"]["different"]
@@ -164,11 +158,8 @@ def real_notes(read: ReadSet, settings: dict[str, Any]) -> list[str]:
     ]
     notes += [f"known: {line}" for line in content.known]
     if different:
-        named = ", ".join(different[:3]) + (
-            f" and {len(different) - 3} more" if different[3:] else ""
-        )
         notes.append(
-            f"files that differ from those of that commit: {named}; scores on them compare with "
+            f"files that differ from those of that commit: {first_of(different, 3)}; scores on them compare with "
             f"nobody else's"
         )
     return notes

@@ -6,7 +6,6 @@ recovered; float32 would be off by a few 0.0001 mm."""
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,14 @@ from fpp_ml_bench.containers import matrix_bytes, pfm_bytes, png_bytes
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import depth_range_mm, normalise, object_mask
 from fpp_ml_bench.errors import BuildError, DatasetError
-from fpp_ml_bench.files import whole_folder
+from fpp_ml_bench.files import whole_folder, write_files
 from fpp_ml_bench.loaders.captures.exports import depth_ply, depth_png, finest_unit_mm
 from fpp_ml_bench.loaders.published import tree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
 from fpp_ml_bench.loaders.storage.parquet import write_parquet
 from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
-from fpp_ml_bench.optics.patterns import export_patterns
+from fpp_ml_bench.optics.patterns import pattern_files
 from fpp_ml_bench.optics.sequence import Direction, Sequence
 
 FORMS = ("parquet", "mat", "maps", "meshes", "patterns")
@@ -103,36 +102,29 @@ def write_maps(
     dataset: DatasetFolder,
     folder: Path,
     splits: list[str],
-    maps: "Maps",
-    row_done: Callable[[], None] = lambda: None,
+    forms: tuple[str, ...],
+    depth_of: Callable[[str], NDArray[Any]],
+    progress: Callable[[int], None],
 ) -> None:
-    """Write a depth map of every sample of ``splits`` as ``SAMPLE.FORM`` in mm, and `SCALE_FILE`,
-    which says what a level of the PNG is."""
+    """Write what ``depth_of`` gives for every sample of ``splits``, (H, W) in mm, 0 = none, as
+    ``SAMPLE.FORM`` in ``forms`` of `MAP_FORMS`, and `SCALE_FILE`, which says what a level of the
+    PNG is."""
     samples = [sample for split in splits for sample in dataset.samples(split)]
     unit_mm = 0.0
-    if "png" in maps.forms:
-        largest_mm = max(float(maps.depth_mm(sample).max()) for sample in samples)
+    if "png" in forms:
+        largest_mm = max(float(depth_of(sample).max()) for sample in samples)
         unit_mm = finest_unit_mm(largest_mm)
         _write(folder / SCALE_FILE, f"{unit_mm:g} mm are a level of every PNG here\n".encode())
+    written = {
+        "pfm": pfm_bytes,
+        "png": lambda depth_mm: depth_png(depth_mm, unit_mm),
+        "ply": lambda depth_mm: depth_ply(depth_mm, dataset.rig.camera),
+    }
     for sample in samples:
-        depth_mm = maps.depth_mm(sample).astype(np.float32)
-        written = {
-            "pfm": lambda depth=depth_mm: pfm_bytes(depth),
-            "png": lambda depth=depth_mm: depth_png(depth, unit_mm),
-            "ply": lambda depth=depth_mm: depth_ply(depth, dataset.rig.camera, None),
-        }
-        for form in maps.forms:
-            _write(folder / f"{sample}.{form}", written[form]())
-        row_done()
-
-
-@dataclass(frozen=True)
-class Maps:
-    """Which depth maps are written: ``forms`` of `MAP_FORMS`, of what ``depth_mm`` gives for a
-    sample, (H, W) in mm, 0 = none."""
-
-    forms: tuple[str, ...]
-    depth_mm: Callable[[str], NDArray[Any]]
+        depth_mm = depth_of(sample).astype(np.float32)
+        for form in forms:
+            _write(folder / f"{sample}.{form}", written[form](depth_mm))
+        progress(1)
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -154,7 +146,8 @@ def export(
     splits: list[str],
     threads: int = 1,
     progress: Callable[[int], None] = lambda rows: None,
-    maps: Maps | None = None,
+    map_forms: tuple[str, ...] = MAP_FORMS,
+    depth_of: Callable[[str], NDArray[Any]] | None = None,
 ) -> None:
     """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into
     folders of their names. ``out`` must be new or empty and is written completely or not at all;
@@ -185,13 +178,14 @@ def export(
                 write_parquet(dataset, folder, splits, threads, progress)
             elif form == "mat":
                 write_tree(dataset, folder, splits, threads, lambda: progress(1))
-            elif form == "maps" and maps is not None:
-                write_maps(dataset, folder, splits, maps, lambda: progress(1))
+            elif form == "maps":
+                depth_mm = depth_of or dataset.depth_mm
+                write_maps(dataset, folder, splits, map_forms, depth_mm, progress)
             elif form == "meshes":
                 for path in meshes:
                     shutil.copyfile(path, folder / path.name)
             else:
-                export_patterns(dataset.rig, folder)
+                write_files(folder, pattern_files(dataset.rig), BuildError)
 
 
 def _meshes(dataset: DatasetFolder, objects: list[str]) -> list[Path]:

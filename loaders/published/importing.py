@@ -3,7 +3,7 @@ build. `SampleReader` reads a sample, fringe, depth in mm and raw frames, with e
 contents. And what a tree's raw scans and depths say about the rig, whose pitch and projector are
 not published."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -450,7 +450,7 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
 
 
 def tree_views(
-    reader: SampleReader, threads: int = 1, progress: Callable[[int], None] = lambda views: None
+    reader: SampleReader, threads: int = 1, progress: Progress = lambda views: None
 ) -> list[DepthView]:
     """Phase and depth of all samples of a tree, some pixels of each. ``reader``: that of
     `plan_import`; of its rig, camera, sequence and frame order are used. ``progress`` is called

@@ -20,7 +20,7 @@ from fpp_ml_bench.coding.phase_shift import phase_weights, weighted_sums
 from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.examination.signals import lines_at
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction, Frame, Sequence
+from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, Direction, Frame, Sequence
 
 AUTO = "auto"
 _Run = tuple[str, Direction]
@@ -107,14 +107,14 @@ def all_orders() -> Iterator[FrameOrder]:
 
 def find_order(files: list[NDArray[np.uint8]], rig: Rig) -> FrameOrder | None:
     """The named order that the images of a raw scan fit, or None."""
-    scan = _Scan(files)
-    return next((order for order in all_orders() if not _misfits(scan, order, rig)), None)
+    scan = _Scan(files, rig)
+    return next((order for order in all_orders() if not _misfits(scan, order)), None)
 
 
 def check_order(files: list[NDArray[np.uint8]], order: FrameOrder, rig: Rig) -> list[str]:
     """Contradictions between ``order`` and the images of a raw scan, uint8 (H, W) in file order;
     empty if they fit."""
-    return _misfits(_Scan(files), order, rig)
+    return _misfits(_Scan(files, rig), order)
 
 
 class _Scan:
@@ -123,11 +123,11 @@ class _Scan:
     along y, ``lit_share``; and which of them have their successor as neighbour along x and along y,
     ``pairs``."""
 
-    def __init__(self, files: list[NDArray[np.uint8]]) -> None:
+    def __init__(self, files: list[NDArray[np.uint8]], rig: Rig) -> None:
         places = [
             np.unique(np.linspace(0, side - 1, _LINES).astype(int)) for side in files[0].shape
         ]
-        lines = lines_at(files, *places)
+        lines = lines_at(files, rig, *places)
         self.mean = np.array([float(image.mean(dtype=np.float64)) for image in files])
         self.darkest, self.brightest = int(self.mean.argmin()), int(self.mean.argmax())
         lit = lines.levels[self.brightest] >= lines.levels[self.darkest] + _LEAST_CONTRAST
@@ -146,10 +146,10 @@ class _Scan:
         return ((share > _MIDDLE[0]) & (share < _MIDDLE[1])).mean(axis=1)
 
 
-def _misfits(scan: _Scan, order: FrameOrder, rig: Rig) -> list[str]:
+def _misfits(scan: _Scan, order: FrameOrder) -> list[str]:
     """Contradictions between the files and ``order``. Cheap checks come first; the others run only
     if those pass."""
-    sequence = rig.paper_sequence
+    sequence = scan.lines.rig.paper_sequence
     frames = order.frames(sequence)
     file_of_frame = {frame.index: number for number, frame in enumerate(frames)}
     black, white = (file_of_frame[frame.index] for frame in sequence if frame.direction is None)
@@ -180,7 +180,7 @@ def _misfits(scan: _Scan, order: FrameOrder, rig: Rig) -> list[str]:
             problems.append(f"A_{number}.png: expected a sinusoid, got an image of two grey levels")
     if not problems:
         for direction in DIRECTIONS:
-            expected = _expected_gradient(direction, rig)
+            expected = _expected_gradient(direction, scan.lines.rig)
             sinusoids, codes = sequence.sinusoids(direction), sequence.gray(direction)
             problems += _sinusoids(scan, [file_of_frame[i] for i in sinusoids], direction, expected)
             problems += _codes(
@@ -193,11 +193,10 @@ def _expected_gradient(direction: Direction, rig: Rig) -> NDArray[np.float64]:
     """Change of the projector coordinate (px) over half an image pixel in x and in y, on the
     background plane; (2,)."""
     camera = rig.camera
-    x, y = camera.normalised(
+    rays = camera.normalised(
         camera.width / 2 - np.array([0.5, 0, 0.5]), camera.height / 2 - np.array([0.5, 0.5, 0])
     )
-    points = np.stack([x, y, np.ones_like(x)], axis=-1) * rig.background
-    coordinate_px = rig.project(points)[0 if direction == "vertical" else 1]
+    coordinate_px = rig.seen(rays, rig.background)[AXES.index(direction)]
     return coordinate_px[1:] - coordinate_px[0]
 
 

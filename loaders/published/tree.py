@@ -153,7 +153,7 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
     )
 
 
-def scan_tree(root: Path, frames: int, only: Collection[str] | None = None) -> PublishedTree:
+def scan_tree(root: Path, frames: int, only: Collection[str] | None) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError`
     listing all problems. ``root`` holds ``training_datasets/`` and maybe
     ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself. Of the folders of variants and

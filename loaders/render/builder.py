@@ -89,7 +89,7 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     dataset of an earlier version, which counted something else."""
     if manifest.origin != GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
-    rows = [row for part in manifest.samples.values() for row in part]
+    rows = manifest.rows
     if any("mixed_rays" not in row for row in rows):
         raise BuildError(
             f"--explain: expected a dataset of version {__version__}, this one was built by "

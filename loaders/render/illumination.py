@@ -115,7 +115,7 @@ def shine(
         (cosine > 0)
         & (squared_m > NEAREST_M**2)
         & (x * x + y * y + z * z > NEAREST_M**2)
-        & in_pattern(u, v, rig)
+        & rig.projector.holds(u, v)
     )
     shadow_rays = 0
     if light.bounces.shadows and occluder is not None:
@@ -177,17 +177,6 @@ def grey_of_white(light: Light) -> float:
     """Grey level of a matte surface of albedo 1 that gets irradiance 1: the reference exposure is
     set on the matte part of the material."""
     return light.camera.reference_grey / ((1.0 - light.surface.gloss) * light.surface.albedo)
-
-
-def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDArray[np.bool_]:
-    """Which projector pixels (n,), (n,) lie on the pattern, outer pixels included whole; NaN does
-    not; bool (n,)."""
-    return (
-        (u >= -0.5)
-        & (u <= rig.projector.width - 0.5)
-        & (v >= -0.5)
-        & (v <= rig.projector.height - 0.5)
-    )
 
 
 def reflectance(

@@ -16,14 +16,21 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.files import read_yaml
-from fpp_ml_bench.schema import NonNegative, Positive, Share, StrictModel, Text, as_tuple, validate
+from fpp_ml_bench.schema import (
+    NonNegative,
+    Positive,
+    Share,
+    SparseModel,
+    StrictModel,
+    Text,
+    as_tuple,
+    validate,
+)
 
 LIGHTS = Path(__file__).resolve().parent / "lights"
 NAMED = ("paper", "workshop", "hard")
@@ -61,16 +68,15 @@ class ProjectorLight(StrictModel):
     flicker: Annotated[float, Field(ge=0, le=0.2)] = 0.0
 
 
-SHARES = ("object_share", "wall_share")
-
-
-class SurfaceLight(StrictModel):
+class SurfaceLight(SparseModel):
     """``albedo`` of the diffuse part; ``gloss``: weight of a GGX microfacet lobe of ``roughness``
     (its alpha is the square). ``textures``: none, or albedo maps by the object's kind, whose dark
     parts have (1 - ``contrast``) of the albedo; with them ``gloss`` is the most, and each object
     has its share of it. ``object_share`` and ``wall_share`` of the albedo are what the object and
     the background plane have: dark paint, a dark wall, none."""
 
+    SPARSE = ("object_share", "wall_share")
+    """So that lights from before there were shares keep their fingerprints."""
     albedo: Annotated[float, Field(gt=0, le=0.95)] = 0.8
     gloss: Annotated[float, Field(ge=0, le=0.95)] = 0.0
     roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.95
@@ -83,15 +89,6 @@ class SurfaceLight(StrictModel):
     def wall_albedo(self) -> float:
         """Of the background plane, which is matte."""
         return (1.0 - self.gloss) * self.albedo * self.wall_share
-
-    @model_serializer(mode="wrap")
-    def _described(self, described: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A share of 1 is left out, so that lights from before there were shares keep their
-        fingerprints."""
-        content: dict[str, Any] = described(self)
-        return {
-            key: value for key, value in content.items() if not (key in SHARES and value == 1.0)
-        }
 
 
 class BounceLight(StrictModel):

@@ -72,17 +72,11 @@ class Lighting:
         gain[candidates[traced.shadowed(self._points_m[candidates], centre_m)]] = 0.0
         return replace(self._empty, gain=gain, shadow_rays=candidates.size)
 
-    def upon(
-        self, mesh: SolidMesh, traced: TracedObject, degrees: float, offset_m: NDArray[np.float64]
-    ) -> "ObjectLight":
-        """The light upon ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be
-        ``traced``."""
-        return ObjectLight(self, mesh, traced, degrees, offset_m)
-
 
 @dataclass(frozen=True)
 class ObjectLight:
-    """The light upon a placed object."""
+    """The light upon ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be
+    ``traced``."""
 
     lighting: Lighting
     mesh: SolidMesh

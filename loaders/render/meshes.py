@@ -5,10 +5,8 @@ The 50 objects and the 20 of the set ``unseen`` are data, `MESHES_FILE`.
 ``benchmarks/objects/draw.py`` draws them.
 """
 
-import io
 import re
 from collections import Counter
-from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
@@ -65,17 +63,6 @@ def stored_mesh(name: str) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     with np.load(MESHES_FILE) as stored:
         steps = np.cumsum(stored[f"{name}.vertices"], axis=0, dtype=np.int64)
         return steps, np.cumsum(stored[f"{name}.faces"], axis=0, dtype=np.int32)
-
-
-def pack_meshes(meshes: Mapping[str, tuple[NDArray[np.integer], NDArray[np.integer]]]) -> bytes:
-    """Content of `MESHES_FILE` for vertices and faces as `stored_mesh` gives them."""
-    rows = {}
-    for name, parts in meshes.items():
-        for part, values in zip(("vertices", "faces"), parts, strict=True):
-            rows[f"{name}.{part}"] = np.diff(values, axis=0, prepend=0).astype(np.int32)
-    content = io.BytesIO()
-    np.savez_compressed(content, allow_pickle=False, **rows)
-    return content.getvalue()
 
 
 def load_user_mesh(description: UserMesh) -> SolidMesh:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.portable import power
+from fpp_ml_bench.portable import dot, power
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Of red, green and blue of BT.709, which are those of sRGB."""
@@ -48,21 +48,13 @@ class Paint:
     ) -> NDArray[np.float64]:
         """Luminance at the places of ``triangle`` (n,) that have the barycentric ``weights`` (n,
         3); float64 (n,)."""
-        luminance = _weighted(self.corner[triangle], weights)
+        luminance = dot(self.corner[triangle], weights)
         on = self.image[triangle]
         for number, image in enumerate(self.images):
             here = np.flatnonzero(on == number)
-            u, v = (_weighted(self.uv[triangle[here], :, axis], weights[here]) for axis in (0, 1))
+            u, v = (dot(self.uv[triangle[here], :, axis], weights[here]) for axis in (0, 1))
             luminance[here] *= bilinear(image, u, v)
         return luminance
-
-
-def _weighted(corners: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    return (
-        weights[:, 0] * corners[:, 0]
-        + weights[:, 1] * corners[:, 1]
-        + weights[:, 2] * corners[:, 2]
-    )
 
 
 def barycentric(corners: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -278,7 +278,7 @@ def blurred(signal: NDArray[np.float64], variance: float) -> NDArray[np.float64]
 
 
 def _distances(rig: Rig) -> NDArray[np.float64]:
-    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    near_m, far_m = rig.range_m
     return np.array([near_m, far_m, rig.background])
 
 

@@ -15,6 +15,7 @@ from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.ray_kernels import SLACK, build_tree, nearest_hit, rasterise
 from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.portable import dot
 
 LEAF = 4
 """Most triangles in a leaf of the box tree."""
@@ -68,14 +69,14 @@ class TracedObject:
     def __init__(self, mesh: SolidMesh, vertices_m: NDArray[np.float64]) -> None:
         corners = vertices_m[mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        lengths = np.sqrt(normals[:, 0] ** 2 + normals[:, 1] ** 2 + normals[:, 2] ** 2)
+        lengths = np.sqrt(dot(normals, normals))
         solid = lengths > 0
         if not solid.any():
             raise MeshError(f"object {mesh.name!r} has no triangle with an area")
         self._row = np.flatnonzero(solid).astype(np.int32)
         self.corners = np.ascontiguousarray(corners[solid], dtype=np.float64)
         self.normals = normals[solid] / lengths[solid, None]
-        self._offsets = _dot(self.normals, self.corners[:, 0])
+        self._offsets = dot(self.normals, self.corners[:, 0])
         self._vertices_m = vertices_m
 
     def primary(self, rays: PixelRays, wanted: NDArray[np.bool_] | None = None) -> Hits:
@@ -157,7 +158,7 @@ class TracedObject:
         """Which surface points (n, 3) the object itself hides from the light at ``light_m`` (3,);
         bool (n,)."""
         toward = light_m - points_m
-        lengths = np.sqrt(toward[:, 0] ** 2 + toward[:, 1] ** 2 + toward[:, 2] ** 2)
+        lengths = np.sqrt(dot(toward, toward))
         origins = points_m + toward * (_SHADOW_OFFSET_M / lengths)[:, None]
         return (
             self.met(origins, np.broadcast_to(light_m, points_m.shape), any_suffices=True)[1] >= 0
@@ -192,9 +193,3 @@ class TracedObject:
         )
         build_tree(self.corners, order, starts, boxes)
         return order, self.corners[order], starts, boxes
-
-
-def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Dot products of rows (n, 3), added in order: `einsum` may fuse multiplications and
-    additions."""
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]

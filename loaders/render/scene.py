@@ -281,7 +281,7 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
     if calibration_px == 0:
         return rig
     draws = [2 * uniform(seed, "calibration", part) - 1 for part in ("x", "y", "z", "u", "v")]
-    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    near_m, far_m = rig.range_m
     across, down = (
         (np.arange(16) + 0.5) * (length / 16) - 0.5
         for length in (rig.camera.width, rig.camera.height)
@@ -358,7 +358,7 @@ def distance_bounds_m(about_axis_m: NDArray[np.float64], rig: Rig) -> tuple[floa
     ``about_axis_m`` (V, 3) from `turned`. The bounds may be crossed (near > far): then the object
     fits nowhere.
     """
-    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    near_m, far_m = rig.range_m
     camera = rig.camera
     left = (camera.cx - _MARGIN_PX) / camera.fx
     right = (camera.width - 1 - camera.cx - _MARGIN_PX) / camera.fx

@@ -20,7 +20,7 @@ from fpp_ml_bench.constants import GOLDEN, PLASTIC
 from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+from fpp_ml_bench.portable import cosine_of_turns, dot, sine_of_turns
 
 POINTS = 1 << 15
 """Points on the surface that carry the projector's light into the surfels: several of each."""
@@ -111,9 +111,7 @@ class Surfels:
         way = reach_m * direction
         along, triangle = traced.met(origin_m, origin_m + way)
         facing, hit = traced.normals[triangle], triangle >= 0
-        behind = (
-            facing[:, 0] * way[:, 0] + facing[:, 1] * way[:, 1] + facing[:, 2] * way[:, 2] > 0.0
-        )
+        behind = dot(facing, way) > 0.0
         target: NDArray[np.int32] = np.full(len(along), -1, dtype=np.int32)
         place_m = origin_m + along[:, None] * way
         assign_hits(
@@ -158,7 +156,7 @@ def place_surfels(
     """Points spread over the triangles ``corners`` (F, 3, 3) by area, and the surfels that they
     make. After ``faces`` triangles the same ones come again, from behind."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.sqrt(normal[:, 0] ** 2 + normal[:, 1] ** 2 + normal[:, 2] ** 2)
+    double = np.sqrt(dot(normal, normal))
     behind = np.cumsum(double / 2)
     area_m2 = float(behind[-1])
     number = np.arange(POINTS)
@@ -167,12 +165,7 @@ def place_surfels(
     )
     first, second = np.sqrt((0.5 + number * PLASTIC) % 1.0), (0.5 + number * _PLASTIC_SQUARED) % 1.0
     weights = np.stack([1.0 - first, first * (1.0 - second), first * second], axis=1)
-    chosen = corners[triangle]
-    position = (
-        weights[:, :1] * chosen[:, 0]
-        + weights[:, 1:2] * chosen[:, 1]
-        + weights[:, 2:] * chosen[:, 2]
-    )
+    position = dot(weights[..., None], corners[triangle])
     facing = normal[triangle] / double[triangle, None]
     cell_m = (
         float(np.sqrt(area_m2 / SURFELS)) * 1.2

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, VIEW_DEGREES, VIEWS, sample_name
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import object_mask, object_near_edge
+from fpp_ml_bench.depth import object_mask, object_near_edges
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.illumination import LitPixels
-from fpp_ml_bench.loaders.render.lighting import Lighting
+from fpp_ml_bench.loaders.render.lighting import Lighting, ObjectLight
 from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pixels, vignetting
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import (
@@ -166,7 +166,7 @@ class Studio:
         """What is seen of ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be
         ``traced``, with its light."""
         rig, light = self.rig, self.light
-        object_light = self.lighting.upon(mesh, traced, degrees, offset_m)
+        object_light = ObjectLight(self.lighting, mesh, traced, degrees, offset_m)
         x, y = (axis.ravel()[hits.pixels] for axis in rig.camera.rays())
         points_m = along_rays(x, y, hits.depth_m)
         lit = object_light.at(points_m, hits.normals, hits.triangle)
@@ -351,7 +351,7 @@ def ground_truth_error(
     void = void_pixels(flags)
     both = seen & decoded & ~void
     error = depth_mm[both].astype(np.float64) - exact_mm[both]
-    inside = error[~object_near_edge(exact_mm, INTERIOR_PX)[both]]
+    inside = error[~object_near_edges(exact_mm, (INTERIOR_PX,))[0][both]]
     return {
         "exact_px": int(seen.sum()),
         "undecoded_px": int((seen & ~decoded).sum()),

@@ -299,7 +299,7 @@ def forget_outdated(
                     f"folder or delete it"
                 )
     for plan in plans:
-        receipt = folder / WORK_FOLDER / f"{plan.name}.json"
+        receipt = folder / _receipt_name(plan)
         sources = (path for sample, _, _ in plan.samples for path in files(sample))
         if receipt.is_file() and any(_changed_after(path, receipt) for path in sources):
             receipt.unlink()

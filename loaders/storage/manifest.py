@@ -146,6 +146,11 @@ class Manifest:
         return (*self.others, *self.shards)
 
     @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of all splits."""
+        return [row for rows in self.samples.values() for row in rows]
+
+    @property
     def splits(self) -> dict[str, list[str]]:
         return {split: [row["sample"] for row in rows] for split, rows in self.samples.items()}
 
@@ -297,20 +302,16 @@ def _check(manifest: Manifest) -> None:
         )
     if not manifest.samples or not all(manifest.samples.values()):
         raise ValueError("samples: expected some in every split")
-    for row in (row for rows in manifest.samples.values() for row in rows):
+    for row in manifest.rows:
         check_row(row)
     if unknown := {shard.group for shard in manifest.shards} - manifest.groups.keys():
         raise ValueError(
             f"unknown group {printable(sorted(unknown)[0])!r}, expected "
             f"{', '.join(manifest.groups)}"
         )
-    path, count = (
-        Counter(file.path for file in manifest.files).most_common(1)[0]
-        if manifest.files
-        else ("", 0)
-    )
-    if count > 1:
-        raise ValueError(f"{path}: is listed twice")
+    for path, count in Counter(file.path for file in manifest.files).items():
+        if count > 1:
+            raise ValueError(f"{path}: is listed twice")
     for name, digest in manifest.content.items():
         if not re.fullmatch(
             rf"({'|'.join(SPLITS)})/[a-z0-9_]{{1,60}} [0-9a-f]{{32}}", f"{name} {digest}"

@@ -105,8 +105,8 @@ def write_parquet(
     dataset: DatasetFolder,
     folder: Path,
     splits: list[str],
-    threads: int = 1,
-    rows_done: Callable[[int], None] = lambda rows: None,
+    threads: int,
+    rows_done: Callable[[int], None],
 ) -> None:
     """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that
     opens it. Raises ``OSError`` when the disk can't be written. Each thread writes a shard and

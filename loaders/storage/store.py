@@ -215,11 +215,6 @@ class DatasetFolder:
             )
         return self._image(sample, DATA_GROUP, column)
 
-    def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background.
-        Which of its pixels count is `void`'s business."""
-        return self.depth_mm(sample, column)
-
     def flags(self, sample: str) -> NDArray[np.uint8]:
         """What is special about each pixel: bits of `loaders.sample.Flag`, uint8 (H, W); of
         generated data."""

@@ -32,7 +32,7 @@ def _values(calibration):
         sigmas += device.sigma
     values += cv2.Rodrigues(np.array(calibration.rotation))[0].ravel().tolist()
     values += calibration.translation_mm
-    sigmas += [*calibration.rotation_sigma_rad, *calibration.translation_sigma_mm]
+    sigmas += [*np.linalg.norm(calibration.root[-6:-3], axis=1), *calibration.translation_sigma_mm]
     return np.array(values), np.array(sigmas)
 
 

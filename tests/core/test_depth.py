@@ -17,7 +17,7 @@ from fpp_ml_bench.depth import (
     normalise,
     object_box,
     object_mask,
-    object_near_edge,
+    object_near_edges,
 )
 
 
@@ -106,7 +106,7 @@ maps = arrays(
 @given(maps, st.integers(0, 8))
 def test_band_is_the_distance_cut_off(depth, band):
     expected = object_mask(depth) & (edge_distance_px(depth, 50) < band)
-    np.testing.assert_array_equal(object_near_edge(depth, band, 50), expected)
+    np.testing.assert_array_equal(object_near_edges(depth, [band], 50)[0], expected)
 
 
 def depth_map(low=1510.123, high=1987.654, shape=(40, 50)):

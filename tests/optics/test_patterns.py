@@ -5,9 +5,10 @@ import pytest
 from conftest import read_image
 
 from fpp_ml_bench.errors import FppBenchError, RigError
+from fpp_ml_bench.files import write_files
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import (
-    export_patterns,
+    pattern_files,
     pattern_image,
     pattern_profile,
     pattern_profiles,
@@ -60,7 +61,7 @@ def test_frames_outside_the_sequence_are_refused(index):
 
 
 def test_export_is_lossless_and_in_order(tmp_path):
-    paths = export_patterns(SMALL, tmp_path / "patterns")
+    paths = write_files(tmp_path / "patterns", pattern_files(SMALL), FppBenchError)
     assert [path.name for path in paths] == [f"A_{i:02}.png" for i in range(18)]
     for index, path in enumerate(paths):
         image = read_image(path)
@@ -70,4 +71,4 @@ def test_export_is_lossless_and_in_order(tmp_path):
 def test_export_to_an_impossible_place_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(FppBenchError, match="can't be written"):
-        export_patterns(SMALL, tmp_path / "file" / "patterns")
+        write_files(tmp_path / "file" / "patterns", pattern_files(SMALL), FppBenchError)

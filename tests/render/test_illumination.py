@@ -9,7 +9,6 @@ from rendering import ALL_PIXELS, CENTRE, DIRECT, RIG, X, Y, plane
 
 from fpp_ml_bench.loaders.render.illumination import (
     Material,
-    in_pattern,
     light_surface,
     reflectance,
 )
@@ -94,7 +93,8 @@ def test_gloss_is_where_the_mirror_direction_is():
 
 def test_the_pattern_ends_with_its_outer_pixels():
     """Beyond there is ambient light alone: see the matte plane."""
-    inside = in_pattern(np.array([-0.5, 911.5, -0.51, np.nan]), np.array([0.0, 1139.5, 0, 0]), RIG)
+    u, v = np.array([-0.5, 911.5, -0.51, np.nan]), np.array([0.0, 1139.5, 0, 0])
+    inside = RIG.projector.holds(u, v)
     assert inside.tolist() == [True, True, False, False]
 
 

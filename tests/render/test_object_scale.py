@@ -71,7 +71,7 @@ def test_the_command_scales_and_says_so(tmp_path):
     settings = json.loads((tmp_path / "set" / "manifest.json").read_text())["settings"]
     assert settings["object_scale"] == 0.3
     assert settings["light"]["projector"]["focus_m"] == pytest.approx(1.8)
-    depth_mm = dataset.target_mm(dataset.samples("train")[0], "depth_exact")
+    depth_mm = dataset.depth_mm(dataset.samples("train")[0], "depth_exact")
     assert 450 < depth_mm[depth_mm > 0].mean() < 630
     said = refusal(fpp_bench, f"{build}/own --object-scale 1")
     assert "does not fit the working range" in said

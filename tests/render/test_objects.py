@@ -20,7 +20,7 @@ from fpp_ml_bench.constants import (
 )
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.builder import plan_build
-from fpp_ml_bench.loaders.render.meshes import MESHES_FILE, pack_meshes, solid_mesh, stored_mesh
+from fpp_ml_bench.loaders.render.meshes import MESHES_FILE, solid_mesh, stored_mesh
 from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import preset_settings, turned
 
@@ -57,7 +57,9 @@ def test_the_file_holds_every_object_and_no_other():
 def test_a_packed_mesh_is_read_as_it_was(monkeypatch, tmp_path):
     steps, faces = stored_mesh("gear")
     file = tmp_path / "objects.npz"
-    file.write_bytes(pack_meshes({"gear": (steps[::-1], faces[::-1])}))
+    packed = {"gear.vertices": steps[::-1], "gear.faces": faces[::-1]}
+    rows = {name: np.diff(values, axis=0, prepend=0) for name, values in packed.items()}
+    np.savez_compressed(file, **rows)
     monkeypatch.setattr("fpp_ml_bench.loaders.render.meshes.MESHES_FILE", file)
     again_steps, again_faces = stored_mesh("gear")
     np.testing.assert_array_equal(again_steps, steps[::-1])

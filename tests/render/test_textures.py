@@ -7,7 +7,7 @@ from rendering import PAPER, RIG
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEW_DEGREES
 from fpp_ml_bench.loaders.render.light import SurfaceLight
-from fpp_ml_bench.loaders.render.lighting import Lighting
+from fpp_ml_bench.loaders.render.lighting import Lighting, ObjectLight
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh, turned
@@ -116,7 +116,7 @@ def test_a_map_sticks_to_its_object_in_every_view():
         for degrees, away_m in zip(VIEW_DEGREES[:3], (1.7, 1.8, 1.95), strict=False):
             offset = np.array([0.0, 0.0, away_m])
             traced = TracedObject(own, turned(own.vertices_m, degrees) + offset)
-            lit = lighting.upon(own, traced, degrees, offset).at(
+            lit = ObjectLight(lighting, own, traced, degrees, offset).at(
                 turned(place, degrees) + offset,
                 turned(normal, degrees),
                 np.zeros(len(place), dtype=np.int64),

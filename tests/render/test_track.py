@@ -99,7 +99,7 @@ def _predict(small, below, error_mm: float) -> None:
         dataset, folder = DatasetFolder(place), below / name
         folder.mkdir(parents=True)
         for sample in dataset.samples("test"):
-            depth_mm = dataset.target_mm(sample, "depth_exact").copy()
+            depth_mm = dataset.depth_mm(sample, "depth_exact").copy()
             depth_mm[depth_mm > 0] += error_mm
             np.save(folder / f"{sample}.npy", depth_mm)
         (folder / "submission.yaml").write_text(SUBMISSION)

@@ -136,9 +136,9 @@ class Counting:
     def __getattr__(self, name):
         return getattr(self.inner, name)
 
-    def target_mm(self, sample, column="depth"):
+    def depth_mm(self, sample, column="depth"):
         self.read.append(sample)
-        return self.inner.target_mm(sample, column)
+        return self.inner.depth_mm(sample, column)
 
 
 def test_only_shown_samples_are_read(dataset, scored, tmp_path):

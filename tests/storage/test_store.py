@@ -28,7 +28,7 @@ def test_a_method_is_given_no_truth_outside_the_training_split(tiny, opened):
     assert given.without_truth() is given and given.fingerprint == opened.fingerprint
     assert given.splits == opened.splits
     for seen in (given, pickle.loads(pickle.dumps(given))):
-        for look in (seen.depth_mm, seen.target_mm, seen.void, seen.flags, seen.unlit_mm):
+        for look in (seen.depth_mm, seen.void, seen.flags, seen.unlit_mm):
             with pytest.raises(
                 DatasetError,
                 match="is truth of the validation split, and methods are given that of the",
@@ -79,7 +79,7 @@ def test_void_is_of_the_decoded_depth_or_of_scene_and_light_alone(opened):
         depth, exact = (opened.depth_mm(sample, column) for column in ("depth", "depth_exact"))
         flags = opened.flags(sample)
         for column, stored in (("depth", depth), ("depth_exact", exact)):
-            assert np.shares_memory(opened.target_mm(sample, column), stored)
+            assert np.shares_memory(opened.depth_mm(sample, column), stored)
             assert stored.dtype == np.float32
         unlit_or_mixed = (flags & 3) > 0
         np.testing.assert_array_equal(

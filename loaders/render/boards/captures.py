@@ -14,7 +14,7 @@ from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
-from fpp_ml_bench.loaders.render.boards.poses import BoardPose, board_poses
+from fpp_ml_bench.loaders.render.boards.poses import BoardPose
 from fpp_ml_bench.loaders.render.boards.sheet import DARK, board_view, check_print
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -51,13 +51,13 @@ def photograph_board(
     folder: str | Path,
     rig: Rig,
     board: Board,
-    poses: Sequence[BoardPose] | None = None,
+    poses: Sequence[BoardPose],
     light: Light | None = None,
     seed: int = 42,
     progress: Callable[[int], None] = lambda images: None,
 ) -> list[Path]:
-    """Photograph ``board`` with ``rig`` in ``poses`` (by default `board_poses`) under ``light`` (by
-    default `paper`), and return the poses' folders::
+    """Photograph ``board`` with ``rig`` in ``poses`` under ``light`` (by default `paper`), and return
+    the poses' folders::
 
         FOLDER/pose_00/frame_00.png ...     8-bit grey, in the order of the rig's sequence
         FOLDER/board.yaml                   the board, as `parse_board` takes it; its true poses, light and seed
@@ -65,20 +65,17 @@ def photograph_board(
 
     Images have the same grey levels on every processor. An interrupted run is continued: poses that
     are there are left as they are. ``progress`` is called with numbers of finished images. Raises
-    `CaptureError` for a folder with other captures or files, or one that can't be written,
-    `BuildError` for one in use by another process, `CalibrationError` for a board that does not
+    `CaptureError` for a folder with other captures or files, one that can't be written, or that is
+    in use by another process, `CalibrationError` for a board that does not
     fit, and what the builder raises for rig, light and seed."""
     place = Path(folder)
     studio = board_studio(rig, board, light, seed)
-    poses = board_poses(rig, board) if poses is None else tuple(poses)
     described = yaml.safe_dump(
         _description(board, poses, studio), sort_keys=False, default_flow_style=None, width=120
     )
     names = [f"pose_{index:02d}" for index in range(len(poses))]
-    if place.exists() and not place.is_dir():
-        raise CaptureError(f"{place}: is a file; give a folder")
     try:
-        with exclusive(place / LOCK_FILE, place, "writing this folder"):
+        with exclusive(place / LOCK_FILE, place, "writing this folder", CaptureError):
             _check_folder(place, described, rig)
             write_atomically(place / BOARD_FILE, described.encode())
             save_rig(rig, place / RIG_FILE)

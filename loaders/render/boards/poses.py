@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.constants import GOLDEN, MM_PER_M, PLASTIC
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.loaders.render.scene import along_rays
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.portable import cosine_of_turns, matrix_product, sine_of_turns
 
@@ -84,8 +83,6 @@ def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES) -> tuple[Board
     towards the middle, the corners and the sides of the image in turn, tilted by up to `MOST_TILT`
     in directions all round, upright and turned by a quarter, at distances over the whole range.
     Raises `CalibrationError` for a board that does not fit."""
-    if count < 1:
-        raise CalibrationError(f"expected 1 or more poses, got {count}")
     (left, top), (right, bottom) = (
         np.array(corner) / MM_PER_M for corner in sheet_corners_mm(board)
     )
@@ -127,7 +124,7 @@ def _fitting_pose(
 ) -> BoardPose | None:
     """The pose farthest towards ``place`` (px from ``middle``) at the distance nearest to the share
     of the range."""
-    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    near_m, far_m = rig.range_m
     near_m, far_m = near_m - float(about[:, 2].min()), far_m - float(about[:, 2].max())
     if near_m > far_m:
         return None
@@ -147,33 +144,21 @@ def _fitting_pose(
 
 def _visible(rig: Rig, points_m: NDArray[np.float64]) -> bool:
     """Whether the image and the pattern hold all points (n, 3), with a margin."""
-    for device, (u, v) in (
-        (rig.camera, rig.camera.project(points_m)),
-        (rig.projector, rig.project(points_m)),
-    ):
-        inside = (u >= _MARGIN_PX) & (u <= device.width - 1 - _MARGIN_PX)
-        inside &= (v >= _MARGIN_PX) & (v <= device.height - 1 - _MARGIN_PX)
-        if not inside.all():
-            return False
-    return True
+    seen = (rig.camera, rig.camera.project(points_m)), (rig.projector, rig.project(points_m))
+    return all(device.holds(*pixels, _MARGIN_PX + 0.5).all() for device, pixels in seen)
 
 
 def _seen_by_both(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Middle of the image's part that the projector lights at the standoff, and half of its size,
     (2,) px each."""
-    camera, projector = rig.camera, rig.projector
-    column, row = (
-        axis.ravel() for axis in np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    )
-    x, y = (axis.ravel() for axis in camera.rays())
-    u, v = rig.project(along_rays(x, y, rig.standoff_m))
-    lit = (u >= 0) & (u <= projector.width - 1) & (v >= 0) & (v <= projector.height - 1)
+    lit = rig.projector.holds(*rig.seen(rig.camera.rays(), rig.standoff_m), 0.5)
     if not lit.any():
         raise CalibrationError(
             f"the projector lights nothing that the camera sees at the standoff of "
             f"{rig.standoff_m:g} m; check the rig"
         )
-    low, high = (np.array([f(column[lit]), f(row[lit])], dtype=float) for f in (np.min, np.max))
+    row, column = np.nonzero(lit)
+    low, high = (np.array([f(column), f(row)], dtype=float) for f in (np.min, np.max))
     return (low + high) / 2, (high - low) / 2
 
 
