@@ -394,13 +394,14 @@ def write_certificate(certificate: Certificate, out: Path) -> tuple[Path, Path]:
     """The certificate as a page and as JSON in the folder ``out``; their paths."""
     out.mkdir(parents=True, exist_ok=True)
     kinds = {
-        f"{kind}\n+-{picture[1].high:.2g} mm": picture
+        f"{kind}\n\N{PLUS-MINUS SIGN}{picture[1].high:.2g} mm": picture
         for kind, picture in certificate.pictures.items()
     }
     html = page(
         "fpp_ml_bench.baselines.certify",
         "certificate.html",
         "Simulated type test" if certificate.simulated else "Test on a board",
+        "h2 { margin-top: 1.5rem } "
         "td.words, th[scope=row], th[scope=col]:first-child { text-align: left }",
         test=certificate,
         rig=json.dumps(dict(certificate.rig)),
