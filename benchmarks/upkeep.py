@@ -115,7 +115,7 @@ row of its own."""
 CROSSED = {
     "crossed": "crossed",
     "crossed-03": "crossed --frames 3",
-    "fringe-net-crossed": "fringe-net",
+    "fringe-net-crossed": "fringe-net --fringes crossed",
 }
 """The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be
 the same rows."""
@@ -125,6 +125,9 @@ COARSE = {
 }
 """The same for ``--pitch 36 --config single_shot``: the finest single fringe with one period in the
 working range, as ``fpp-bench patterns paper --design`` names it."""
+BY_NAME = {"crossed-audit": "crossed --audit"}
+"""Made only where ``--only`` names it: a benchmark's calibration is right."""
+NAMED = METHODS | CROSSED | COARSE | BY_NAME
 
 
 def run(command: str, *words: object) -> None:
@@ -141,7 +144,7 @@ def make_row(
 ) -> None:
     """Predictions, time, result and row of a setting."""
     predictions, result = work / name, work / f"{name}.json"
-    method, *options = (METHODS | CROSSED | COARSE)[name].split()
+    method, *options = NAMED[name].split()
     options += ["--training", str(training)] if training is not None and method == "nearest" else []
     settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
@@ -495,7 +498,7 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--only",
         nargs="+",
-        choices=METHODS | CROSSED | COARSE,
+        choices=NAMED,
         metavar="NAME",
         help="only these rows",
     )

@@ -482,7 +482,9 @@ def _outline_changes(
         ]
     for name, cut in cuts.items():
         kept = cut.ravel()[surface.pixels]
-        part = Surface(**{key: values[kept] for key, values in vars(surface).items()})
+        part = seen_by(
+            renderer.rig, surface.pixels[kept], surface.depth_m[kept], surface.normals[kept]
+        )
         yield Variant(
             "outline",
             name,
@@ -500,14 +502,11 @@ def _grown(sample: Scene, renderer: SceneRenderer) -> Scene:
     distance_px, nearest = distance_transform_edt(~target, return_indices=True)
     ring = (distance_px > 0) & (distance_px <= GROWTH * np.sqrt(target.sum())) & (surface_index < 0)
     source = surface_index[tuple(nearest)][ring]
-    added = seen_by(
-        renderer.rig, np.flatnonzero(ring), surface.depth_m[source], surface.normals[source]
-    )
-    both = Surface(
-        *(
-            np.concatenate(pair)
-            for pair in zip(vars(surface).values(), vars(added).values(), strict=True)
-        )
+    both = seen_by(
+        renderer.rig,
+        np.concatenate([surface.pixels, np.flatnonzero(ring)]),
+        np.concatenate([surface.depth_m, surface.depth_m[source]]),
+        np.concatenate([surface.normals, surface.normals[source]]),
     )
     lit = replace(
         renderer.light(both), gain=np.concatenate([sample.lit.gain, sample.lit.gain[source]])

@@ -121,7 +121,7 @@ def train(
             best = training.best["epoch"] if training.history else 0
             run = TrainingRun(out, training.epoch, best, seconds, training.over)
             if run.finished and training.accelerator.is_main_process:
-                summary = {key: vars(run)[key] for key in ("epochs", "best_epoch", "seconds")}
+                summary = {"epochs": run.epochs, "best_epoch": best, "seconds": seconds}
                 write_atomically(out / DONE, json.dumps(summary).encode())
             training.accelerator.wait_for_everyone()
             return run

@@ -88,7 +88,8 @@ _TYPES: dict[str, Any] = {
 
 
 def _fields(metrics: Iterable[Metric]) -> dict[str, Any]:
-    """A field for each metric, as the annotations of a model."""
+    """A field for each metric, as the annotations from which pydantic makes a model: written out
+    here, a new metric would be two entries."""
     types = ((metric, _TYPES[metric.unit]) for metric in metrics)
     return {
         metric.key: Annotated[kind, Field(default=None)] if metric.optional else kind

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import MISSING, Field, dataclass
 from functools import partial
-from inspect import getdoc, signature
+from inspect import get_annotations, getdoc, signature
 from io import StringIO
 from pathlib import Path
 from shutil import get_terminal_size
@@ -342,7 +342,7 @@ class Command(click.Command):
 
 def heading_of(group: type, name: str) -> str:
     """What stands above an option in the help: ``HEADING`` of the class whose field it is."""
-    owner = next(base for base in group.__mro__ if name in vars(base).get("__annotations__", {}))
+    owner = next(base for base in group.__mro__ if name in get_annotations(base))
     return str(vars(owner).get("HEADING", OPTIONS))
 
 

@@ -113,7 +113,12 @@ class Coordinates:
 
     def at(self, indices: NDArray[np.intp]) -> "Coordinates":
         """The coordinates of the pixels at ``indices`` only."""
-        return Coordinates(*(values[indices] for values in vars(self).values()))
+        return Coordinates(
+            self.coordinate_px[indices],
+            self.modulation[indices],
+            self.phase[indices],
+            self.reason[indices],
+        )
 
 
 class Shown(NamedTuple):

@@ -59,6 +59,18 @@ def test_exact_coordinates_give_exact_depth(rig):
     assert from_both.disagreement_px.max() < 1e-7
 
 
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
+def test_opencv_triangulates_the_same_points(rig):
+    rays, _, u, v = scene(rig)
+    camera = np.hstack([np.eye(3), np.zeros((3, 1))])
+    projector = np.hstack([rig.R, rig.t[:, None]])
+    camera_points = np.stack([axis.ravel() for axis in rays])
+    projector_points = np.stack([axis.ravel() for axis in rig.projector.normalised(u, v)])
+    points = cv2.triangulatePoints(camera, projector, camera_points, projector_points)
+    expected = (points[2] / points[3]).reshape(u.shape) * 1000
+    np.testing.assert_allclose(depth_from_both(rays, u, v, rig).depth_mm, expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["paper", "general", "camera lens"])
 def test_least_squares_is_the_optimisers(name):
     rig = RIGS[name]
