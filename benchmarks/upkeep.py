@@ -72,6 +72,7 @@ from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import SELF_REPORTED, VOUCHED, Entry, read_entry, vouching_line
 from fpp_ml_bench.leaderboard.tables import ranking_table
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import PAPER_PITCH_PX
 from fpp_ml_bench.style import millimetres, percent
 from fpp_ml_bench.tables import Table, markdown_text
@@ -533,6 +534,13 @@ def parser() -> argparse.ArgumentParser:
     return words
 
 
+def _methods_for(rig: Rig) -> Mapping[str, str]:
+    """The methods of a benchmark's rig."""
+    if rig.crossed is not None:
+        return CROSSED
+    return METHODS if rig.pitch("horizontal") == PAPER_PITCH_PX else COARSE
+
+
 def make_rows(args: argparse.Namespace) -> None:
     """Make the rows that ``args`` name; SubmissionError for a folder of earlier work."""
     if args.work.exists() and any(args.work.iterdir()):
@@ -543,8 +551,7 @@ def make_rows(args: argparse.Namespace) -> None:
     suffix = (
         args.suffix if args.suffix is not None else "" if "train" in opened.splits else "-unseen"
     )
-    plain = METHODS if opened.rig.pitch("horizontal") == PAPER_PITCH_PX else COARSE
-    for name in args.only or (plain if opened.rig.crossed is None else CROSSED):
+    for name in args.only or _methods_for(opened.rig):
         make_row(
             args.dataset,
             args.work,

@@ -153,6 +153,7 @@ def test_options_named_in_the_text_of_a_page_exist(page):
     assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known
 
 
+@pytest.mark.long
 def test_python_of_the_pages_runs(tiny, tmp_path, monkeypatch):
     """Block by block, with small datasets in the place of the named ones. README's:
     tests/cli/test_front_door.py."""

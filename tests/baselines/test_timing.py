@@ -194,6 +194,7 @@ def test_counts_are_counts(value, predicted):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "message"),
     [

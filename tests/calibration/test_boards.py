@@ -53,6 +53,7 @@ def _centroids_of(board):
     return np.array(centres)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "text, tolerance_px",
     [
@@ -72,6 +73,7 @@ def test_drawn_boards_are_found(text, tolerance_px):
     assert np.sqrt(((corners - expected) ** 2).sum(1).mean()) < tolerance_px
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "text",
     [

@@ -103,6 +103,7 @@ def test_a_given_baseline_sets_the_scale():
     assert scaled.rms_px.both == pytest.approx(free.rms_px.both, rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("radius_known", [True, False])
 def test_the_bias_of_circles_is_taken_off(radius_known):
     radius_mm = 7.0
@@ -186,6 +187,7 @@ def _turned(points, board):
     return np.array([1, 1, 0]) * (2 * board.points_mm().mean(0)) + np.array([-1, -1, 1]) * points
 
 
+@pytest.mark.long
 def test_the_lens_that_was_there_predicts_best_and_a_bad_pose_is_named():
     poses = rigs.poses(BOARD.points_mm(), noise_px=0.05)
     found = [

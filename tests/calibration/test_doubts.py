@@ -61,6 +61,7 @@ def test_an_irregular_board_and_panels_of_oblong_pixels_are_not_doubted():
     assert doubts(halved, sizes=(rigs.CAMERA_SIZE, (912, 570))) == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("poses", "options", "said"),
     [

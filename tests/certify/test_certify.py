@@ -207,6 +207,7 @@ def test_a_certificate_judges_by_its_limits_and_says_what_it_is(few, tmp_path):
     assert json.loads(data.read_text())["lines"][0]["symbol"] == "PF"
 
 
+@pytest.mark.long
 def test_a_method_that_does_not_look_is_found_out(few):
     test = certify(Far(RIG), scenes_of(RIG, "paper"), "paper", 2)
     lines = {line.symbol: line for line in test.lines}

@@ -264,6 +264,7 @@ def test_info_for_people(tiny, opened):
 # ---- show
 
 
+@pytest.mark.long
 def test_show_writes_a_picture_of_the_sample(tiny, tmp_path):
     out = tmp_path / "new" / "bowl.png"
     assert fpp_bench(f"show {tiny} bowl_A0 --out {out}") == 0
@@ -323,6 +324,7 @@ def test_show_refuses_predictions_that_could_not_be_scored(tiny, tmp_path):
     assert not (tmp_path / "x.png").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", [f"--size {TINY_SIZE} --config single_shot", "--rig rig.yaml"])
 def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(
     tmp_path, monkeypatch, words

@@ -399,6 +399,7 @@ def test_an_output_that_can_not_be_written(tiny):
         assert "error: standard output" in done.stderr and "No space left on device" in done.stderr
 
 
+@pytest.mark.long
 def test_everything_is_written_before_a_table_that_nobody_reads(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr("fpp_ml_bench.cli.console.show", Mock(side_effect=BrokenPipeError))
     assert predict(tiny, tmp_path / "predictions") == 0

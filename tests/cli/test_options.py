@@ -292,6 +292,7 @@ def test_a_dataset_that_was_moved_is_asked_for(predicted):
     assert score("elsewhere") == 0
 
 
+@pytest.mark.long
 def test_a_dataset_that_was_changed_is_refused(predicted):
     shutil.rmtree("copy")
     assert fpp_bench(BUILD, "copy --seed 1") == 0
@@ -337,6 +338,7 @@ def test_predictions_of_another_dataset_are_refused(predicted):
     assert score("other", VALIDATION) == 0  # it says nothing
 
 
+@pytest.mark.long
 def test_the_same_data_with_fewer_frames_are_scored(predicted):
     assert fpp_bench(BUILD, "fewer --config single_shot") == 0
     assert score("fewer", VALIDATION) == 0

@@ -70,6 +70,7 @@ def captured_at(u, pitch, blur_px, noise, modulation, gray_shift_px=0.0):
     return np.clip(np.rint(10 + modulation / 127.5 * np.array(levels) + error), 0, 255)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pitch", [18, 12.8, 6])
 @pytest.mark.parametrize(
     "blur_px, noise, modulation", [(0.0, 1.0, 60.0), (1.5, 2.0, 40.0), (3.0, 1.5, 25.0)]

@@ -67,6 +67,7 @@ def test_all_sources_are_tested_and_valid(valid):
     } == dict.fromkeys(valid, "read")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", YAML + JSON + CODED)
 def test_mutations_are_read_or_refused(name, valid):
     """Some of each, or the mutations would test nothing."""
@@ -134,6 +135,7 @@ def test_hostile_yaml(name, attack, valid):
     assert re.search(message, refused(valid[name], text))
 
 
+@pytest.mark.long
 def test_dates_stay_text_and_numbers_numbers():
     assert strict_yaml("{a: 2001-99-99, b: 2026-01-31 10:00:00, c: 1e-3, d: -0.5}") == {
         "a": "2001-99-99",

@@ -8,6 +8,7 @@ from conftest import fpp_bench, printed, refusal
 from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 
+@pytest.mark.long
 def test_a_rig_gets_the_proposed_pair(tmp_path):
     written, picture = tmp_path / "crossed.yaml", tmp_path / "design.png"
     words = f"--pitches 9-20 --pair 18,14 --out {written} --picture {picture}"
@@ -43,6 +44,7 @@ def test_a_rig_of_one_direction_keeps_its_code(tmp_path):
     assert written.directions == ("vertical",)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "words, message",
     [

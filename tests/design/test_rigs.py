@@ -18,6 +18,7 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 
+@pytest.mark.long
 def test_a_drawn_rig_is_one_that_a_lab_could_own() -> None:
     rig, again = (drawn_rig(np.random.default_rng([5, 3])) for _ in range(2))
     assert rig == again == rig_from_dict(rig.to_dict())

@@ -56,6 +56,7 @@ def brute_force(rig, crossed, samples=500):
     return rival, background
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rig", [PAPER, TURNED, SIDEWAYS], ids=["paper", "turned", "sideways"])
 @pytest.mark.parametrize(
     "crossed",
@@ -149,6 +150,7 @@ def test_noise_alone_is_that_of_drawn_noise():
     assert found.phase_mm == pytest.approx(np.std(errors), rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rig", [PAPER, TURNED, SIDEWAYS], ids=["paper", "turned", "sideways"])
 def test_the_search_proposes_the_least_expected_error(rig):
     found = search(rig, Assumptions())

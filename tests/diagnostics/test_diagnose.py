@@ -98,6 +98,7 @@ def call(*arguments):
 # ---- the command
 
 
+@pytest.mark.long
 def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(
     tiny, module_file, tmp_path, capsys, monkeypatch
 ):
@@ -154,6 +155,7 @@ def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tm
     assert "Not run: classical is a method without a network" in (out / "index.html").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("network", "units", "what"),
     [

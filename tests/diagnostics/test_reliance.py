@@ -186,6 +186,7 @@ def test_an_answer_of_another_form_is_named(scene_set):
         measure(reader, *scene_set)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "reader",
     [

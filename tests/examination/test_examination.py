@@ -63,6 +63,7 @@ def test_what_decodes_right_is_not_refused_nor_warned_of(sequence, light):
     assert said(photographed(rig, light), rig) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("steps", [3, 4, 9])
 @pytest.mark.parametrize("gamma, noise", [(1.0, 4.0), (1.5, 1.0), (2.2, 1.0)])
 def test_gamma_and_noise_are_no_faults_and_gamma_is_named_where_it_shows(steps, gamma, noise):
@@ -102,6 +103,7 @@ def test_a_late_frame_is_a_wrong_step_and_no_response(steps):
     assert [name for name, _ in said(frames, rig)] == ["wrong step"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [-30, 10, 180])
 def test_the_common_offset_of_phase_and_gray_code_is_measured(degrees):
     shown = vertical(FOUR | {"origin_px": 57 * degrees / 360})
@@ -155,6 +157,7 @@ READINGS = {
 """Code, the frames' new order or what else becomes of them, and what is said of it."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", READINGS)
 @pytest.mark.parametrize("range_mm", [(1500, 2100), (600, 6000)])
 def test_the_reading_that_fits_is_named(name, range_mm):
@@ -177,6 +180,7 @@ def test_binary_numbers_for_gray_code():
     assert "binary numbers" in said(frames, rig)[0][1]
 
 
+@pytest.mark.long
 def test_two_directions_tell_more():
     rig = rig_with(TWO)
     frames = frames_of(rig)
@@ -233,6 +237,7 @@ def test_what_a_rig_can_not_tell_is_listed():
     assert examine(frames_of(both), both).not_checked == ()
 
 
+@pytest.mark.long
 def test_only_what_is_asked_for_is_looked_at():
     rig = rig_with(TWO)
     frames = frames_of(rig)
@@ -247,6 +252,7 @@ def test_only_what_is_asked_for_is_looked_at():
     assert dark.findings == () and "pixels looked at are lit" in dark.not_checked[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("steps", [3, 8])
 @pytest.mark.parametrize("torn", [1, -1, "gray"])
 @pytest.mark.parametrize("first, last", [(185, 199), (0, 70)])

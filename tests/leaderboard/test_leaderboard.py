@@ -243,6 +243,7 @@ def test_unsound_files_are_refused_by_name(make, tmp_path, capsys):
     assert captured.out == "" and not (tmp_path / "t.md").exists()
 
 
+@pytest.mark.long
 def test_the_files_that_this_package_writes_are_told_apart(tiny, make, capsys):
     first, second = make("a.json", 1.0, name="a"), make("b.json", 2.0, name="b")
     board(first, second, "--json", "board.json")

@@ -222,6 +222,7 @@ ASSUMED = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stem", ASSUMED)
 def test_rows_say_what_they_assume(stem):
     """In a few words in tables, in a sentence on a row's own page."""

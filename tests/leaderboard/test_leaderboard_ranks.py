@@ -304,6 +304,7 @@ def test_who_is_behind_whom_is_what_the_listed_pairs_say():
     assert told_apart > 200
 
 
+@pytest.mark.long
 def test_a_table_of_hundreds_of_rows_is_ranked_and_lists_no_pairs(base):
     rng = np.random.default_rng(2)
     errors = rng.lognormal(0, 1, (300, 1)) * rng.uniform(1, 1.3, (300, 25))

@@ -82,6 +82,7 @@ def _warped(warp: Warp, phases: np.ndarray, inside: np.ndarray) -> Perfect:
     return Perfect(np.stack(answers), taken(inside) > 0.5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", RIGS)
 def test_perfect_phases_give_perfect_depth(name: str) -> None:
     """Where the order is right, the depth of the true phase is the true depth; the object is what

@@ -105,6 +105,7 @@ def test_any_carriers_come_to_those_that_are_known() -> None:
         assert warp.needed == (period_px != seen_px)
 
 
+@pytest.mark.long
 def test_settings_are_drawn_again_the_same_and_of_their_split() -> None:
     first, again = (settings_of(2, 3, 1, 7) for _ in range(2))
     assert first == again and [one.split for one in first] == ["train"] * 2 + ["validation"] * 3

@@ -29,6 +29,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", OTHERS)
 def test_both_carriers_come_to_those_that_were_learned(name: str) -> None:
     """Plane waves of the rig's carriers become plane waves of the learned ones, of the same sign,

@@ -144,6 +144,7 @@ def test_saturated_frames_are_named(capture, decode, tmp_path, capsys):
     assert (np.load(tmp_path / "out" / "reason.npy") == Reason.SATURATED).any()
 
 
+@pytest.mark.long
 def test_findings_are_told_and_anyway_decodes(capture, scan, decode, tmp_path, capsys):
     frames, out = list(capture[1]), tmp_path / "out"
     frames[3] = frames[2]
@@ -166,6 +167,7 @@ def test_findings_are_told_and_anyway_decodes(capture, scan, decode, tmp_path, c
     assert report["pixels"] and not (out / "depth.mat").exists()
 
 
+@pytest.mark.long
 def test_jpeg_is_a_finding(capture, decode, tmp_path):
     _, frames, exact_mm = capture
     jpeg = write(tmp_path / "jpeg", frames, "jpg", [cv2.IMWRITE_JPEG_QUALITY, 80])
@@ -179,6 +181,7 @@ def test_jpeg_is_a_finding(capture, decode, tmp_path):
     assert np.median(np.abs(depth_mm - exact_mm)[both]) < 4
 
 
+@pytest.mark.long
 def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(
     scan, decode, tmp_path, monkeypatch
 ):

@@ -116,6 +116,7 @@ def test_refused_points(points_mm, grey, said):
         cloud_html("none", points_mm, grey)
 
 
+@pytest.mark.long
 def test_command(tiny, tmp_path):
     picture = tmp_path / "pictures" / "mug.png"
     said = printed(fpp_bench, f"show {tiny} mug_A0 --out {picture} --cloud")
@@ -149,6 +150,7 @@ def _drawn(pixels: np.ndarray) -> np.ndarray:
     return (np.abs(pixels - pixels[0, 0]) > 8).any(axis=-1)
 
 
+@pytest.mark.long
 def test_page_in_a_browser(browser, tmp_path):
     width = 390
     (page := tmp_path / "bowl.html").write_bytes(cloud_html(HOSTILE, POINTS_MM, GREY[THERE]))

@@ -145,6 +145,7 @@ def test_items_own_their_memory(tiny):
     assert dataset[0].depth.max() == 1  # the file is untouched
 
 
+@pytest.mark.long
 def test_data_loader_gives_the_same_batches_from_a_spawned_worker(tiny):
     dataset = FringeDepthDataset(tiny, "validation", "single_shot", "individual", True)
     loader = DataLoader(dataset, batch_size=4, num_workers=1, multiprocessing_context="spawn")

@@ -107,6 +107,7 @@ def test_an_output_that_is_no_number(tmp_path, fringe):
         load(path).predict(fringe)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NETWORKS)
 def test_every_network_comes_back_as_it_was(tmp_path, name):
     network, size = tiny_network(name, **SMALL[name]), (64, 64)

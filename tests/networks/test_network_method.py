@@ -147,6 +147,7 @@ def test_the_frame_is_the_first_it_was_trained_on(tmp_path):
 # ---- commands
 
 
+@pytest.mark.long
 def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, capsys):
     out, data = str(tmp_path / "p"), str(dataset.path)
     for name, words in (("full", " --mode paper --json"), ("global", "p-global --json")):

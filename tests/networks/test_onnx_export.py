@@ -22,6 +22,7 @@ def _run(path, fringe: torch.Tensor) -> np.ndarray:
     return session.run(None, {INPUT: fringe.numpy()})[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NETWORKS)
 def test_onnxruntime_gives_torch_numbers_at_any_batch(name, tmp_path):
     torch.manual_seed(1)

@@ -74,6 +74,7 @@ def test_roll_and_zoom_are_found_and_corrected(
     assert "across the epipolar lines" in audit.report()["audit"]["says"]
 
 
+@pytest.mark.long
 def test_a_frame_that_no_small_motion_explains_is_refused() -> None:
     image = frame(surface(), rolled(4.0))
     _, audit = measure_audited(route(), image)

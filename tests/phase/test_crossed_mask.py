@@ -187,6 +187,7 @@ def like_the_wall(true: Rig) -> NDArray[np.float64]:
     return np.where(INSIDE, depths_mm[np.argmin(off_rad)], 0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "true", [CUT, BESIDE["calibration 1.0 px"]], ids=["no wall", "calibration 1 px"]
 )

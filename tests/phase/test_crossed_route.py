@@ -62,6 +62,7 @@ def test_nearness_and_depth_are_inverse_and_the_phases_those_of_the_rig(rig: Rig
         assert np.abs(carriers.depth_mm(shown) - depth_mm).max() < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("middle_mm", [1560.0, 1800.0, 2040.0])
 @every_rig
 def test_a_slab_at_any_distance(rig: Rig, middle_mm: float) -> None:

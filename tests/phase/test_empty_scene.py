@@ -44,6 +44,7 @@ def _invented(rig, light, fringes: str) -> float:
     return float(inside[(depth_mm == 0) & ((flags & VOID) == 0)].mean())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fringes", ["crossed", "horizontal"])
 def test_dark_and_blurred_corners_are_no_object(fringes: str) -> None:
     assert _invented(WIDE, LENSES, fringes) < 0.01
@@ -53,6 +54,7 @@ NARROW = replace(RIG, projector=replace(RIG.projector, width=700, cx=455.5))
 """A projector that leaves a quarter of the wall dark."""
 
 
+@pytest.mark.long
 def test_a_wall_beyond_the_projectors_image_is_no_object(monkeypatch: pytest.MonkeyPatch) -> None:
     lit, edge = empty_scene.pattern_on_plane(NARROW, NARROW.background_m)
     assert 0.02 < 1 - lit.mean() < 0.4 and edge.any()

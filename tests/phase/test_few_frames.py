@@ -84,6 +84,7 @@ def test_steps_are_spread_and_complete_each_other() -> None:
             steps_of(18, wrong)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("frames", [3, 4, 18])
 def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> None:
@@ -102,6 +103,7 @@ def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> Non
     ].mean() == pytest.approx(np.abs(error).mean(), rel=0.25)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("distance_m", [1.55, 1.8, 2.05])
 @pytest.mark.parametrize("frames", [2, 3])
 def test_a_plane_is_at_its_distance_without_gray_code(frames: int, distance_m: float) -> None:
@@ -126,6 +128,7 @@ def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
     assert off[1] > 5 * off[3]
 
 
+@pytest.mark.long
 def test_frames_are_added_until_the_stated_error_is_expected() -> None:
     frames, truth = scene(1.8, 1.72), exact_mm(1.8, 1.72)
     looks = looks_of(FewestFrames(RIG, 1e-3).answer(frames))

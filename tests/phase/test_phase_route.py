@@ -75,6 +75,7 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pitch_px", [18, 44])
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_fringes_with_a_crest_anywhere(frames: int, pitch_px: float) -> None:
@@ -152,6 +153,7 @@ def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
     assert 2.2 < spread[3.0] / spread[1.0] < 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
 @pytest.mark.parametrize("name", ["cork", "cracker_box"])
 def test_objects_at_unknown_distance(name: str, rig: Rig) -> None:
@@ -229,6 +231,7 @@ def test_saturated_ambiguous_and_thin_are_said() -> None:
     assert thin.counts["measured"] < 200
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_without_background_brightness_needs_the_users_word(frames: int, direction: str) -> None:
@@ -261,6 +264,7 @@ def test_the_users_word_gives_way_to_the_images_own_background() -> None:
     np.testing.assert_array_equal(told.confidence, own.confidence)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("name", ["cork", "mug"])
 def test_exposure_does_not_matter(name: str, direction: str) -> None:
@@ -292,6 +296,7 @@ def test_noise_of_an_image_is_found_in_it(sigma: float) -> None:
         assert image_noise_grey(row.frames[first]) == pytest.approx(sigma, rel=0.15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "span", [(1700.0, 1900.0), (1100.0, 2600.0)], ids=["one period or none", "ten periods"]
 )
@@ -306,6 +311,7 @@ def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
     assert np.median(np.abs(measurement.depth_mm - 1800)[lit]) < 1
 
 
+@pytest.mark.long
 def test_the_users_word_from_the_command_line(tmp_path: Path) -> None:
     dataset, out, mask = tmp_path / "set", tmp_path / "phase", tmp_path / "mask.png"
     build(dataset, BuildSettings(RIG, ("cork",), stored="single_shot"), workers=1)

@@ -42,6 +42,7 @@ def tree(tmp_path_factory):
     return folder / "tree"
 
 
+@pytest.mark.long
 def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(tree, tmp_path):
     said = printed(fpp_bench, f"calibrate --from-depth {tree} --out {tmp_path}/rig.yaml")
     assert "power_drill_A240" in said and "whole px" in said and "wrote" in said
@@ -61,6 +62,7 @@ def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(
     assert depth_difference_mm(reader) > 1  # the paper's rig
 
 
+@pytest.mark.long
 def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, capsys):
     line = f"import {tree} --workers 1 --out {tmp_path}"
     assert fpp_bench(f"{line}/assumed") == 0
@@ -122,6 +124,7 @@ def rays(maps):
     return [depth * along for depth in maps]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "change"),
     [

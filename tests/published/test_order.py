@@ -45,6 +45,7 @@ def test_an_unknown_name_is_refused_with_the_list_of_names(name):
         parse_order(name)
 
 
+@pytest.mark.long
 def test_every_named_order_is_found_on_the_images(scan):
     frames, rig = scan
     for order in all_orders():
@@ -52,6 +53,7 @@ def test_every_named_order_is_found_on_the_images(scan):
         assert find_order(files, rig) == order
 
 
+@pytest.mark.long
 def test_any_two_exchanged_files_are_noticed_and_at_least_one_is_named(scan):
     frames, rig = scan
     for i, j in list(combinations(range(52), 2))[::5]:

@@ -104,6 +104,7 @@ def test_v73_files_double_depth_and_rgb_copies_read_the_same(tmp_path):
         assert dataset.depth_mm(sample).tobytes() == depth_of(sample).tobytes()
 
 
+@pytest.mark.long
 def test_two_workers_write_what_one_writes_and_the_root_may_be_the_training_folder(tmp_path):
     tree = make_tree(tmp_path / "tree", info=True)
     single = imported(tree, tmp_path / "one")
@@ -343,6 +344,7 @@ BROKEN_VARIANTS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", BROKEN_VARIANTS)
 def test_variants_and_ranges_that_do_not_fit_together(tmp_path, case):
     variants, place, change, message = BROKEN_VARIANTS[case]
@@ -444,6 +446,7 @@ def test_the_command_imports_and_prints_a_summary(tmp_path):
     assert f"depth taken from {FOLDERS['raw']}" in message and "assumed" not in message
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "words",
     [
@@ -463,6 +466,7 @@ def test_bad_input_to_the_command_is_a_message_and_status_2(tmp_path, monkeypatc
     assert not (tmp_path / "out" / "manifest.json").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mark", [65535, -1, np.nan])
 def test_a_value_for_background_is_read_as_0(mark, tmp_path):
     plain, marked = make_tree(tmp_path / "plain"), make_tree(tmp_path / "marked")

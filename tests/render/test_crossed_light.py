@@ -21,6 +21,7 @@ from fpp_ml_bench.optics.sequence import CodedSequence, Sequence
 SHORT = replace(RIG, sequence=Sequence(steps=3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("response", [1.0, (0.0, 0.3, 0.5, 1.0)])
 @pytest.mark.parametrize("defocus_px", [0.0, 2.5])
 def test_light_is_the_image_through_response_and_blur(response, defocus_px):
@@ -51,6 +52,7 @@ def test_light_is_the_image_through_response_and_blur(response, defocus_px):
     )  # of which rounding to 8 bits 0.004
 
 
+@pytest.mark.long
 def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path):
     family = Crossed((18.0, 14.0), (0.0, 75.0), shifts_deg=CROSSED["crossed-18"].shifts_deg)
     settings = BuildSettings(paper_rig(240).with_crossed(family), ("cork",), stored="crossed")

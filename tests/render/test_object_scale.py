@@ -19,6 +19,7 @@ from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 SIZE = 192
 
 
+@pytest.mark.long
 def test_a_rig_a_third_as_large_sees_the_same_in_a_third_of_the_depth():
     light = named_light("workshop").changed("camera", read_noise_e=0.1, full_well_e=1e6)
 
@@ -61,6 +62,7 @@ def test_users_meshes_keep_their_size():
     assert np.array_equal(settings.sized(mug).vertices_m, 0.5 * mug.vertices_m)
 
 
+@pytest.mark.long
 def test_the_command_scales_and_says_so(tmp_path):
     file = tmp_path / "near.yaml"
     file.write_text(yaml.safe_dump(paper_rig(SIZE).times(0.3).to_dict()))

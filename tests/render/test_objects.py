@@ -132,6 +132,7 @@ def test_mesh_is_centred_and_within_the_working_range(name):
         assert reach.max() <= IMAGE_PX / 2 - MARGIN_PX
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ALL)
 def test_every_view_covers_3_to_40_percent(name):
     cover = [len(depth) / SIZE**2 for depth in views_of(name)]

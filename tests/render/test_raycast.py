@@ -80,6 +80,7 @@ LENSES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("lens", LENSES)
 def test_depth_is_that_of_the_facets(name, lens):

@@ -326,6 +326,7 @@ def in_numpy(exposure, frames, lit, pixels, stream):
     return np.stack(rows)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LIGHTS)
 def test_kernel_and_numpy_give_the_same_bytes(name):
     exposure = exposure_under(name)

@@ -228,6 +228,7 @@ def test_an_object_is_cut_into_surfels_once_for_all_its_views_and_lights(monkeyp
     cut.assert_called_once_with(ball)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stored", ["single_shot", "all"])
 @pytest.mark.parametrize("name", ["paper", "workshop", "hard", "moving"])
 def test_skipping_changes_no_byte(name, stored):

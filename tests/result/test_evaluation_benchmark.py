@@ -54,6 +54,7 @@ def change_dataset(path, **changes):
     path.write_text(json.dumps(content))
 
 
+@pytest.mark.long
 def test_a_result_on_a_benchmark_says_its_name_and_version(named, tmp_path, capsys):
     path = scored_file(named, tmp_path)
     assert read_json(path)["dataset"]["benchmark"] == {"name": "tiny-bench", "version": 4}

@@ -69,6 +69,7 @@ def scored(tmp_path_factory):
     return dataset, predictions, evaluate(predictions, dataset)
 
 
+@pytest.mark.long
 def test_the_block_is_written_read_verified_and_shown(scored, tmp_path):
     dataset, predictions, result = scored
     block = result.uncertainty

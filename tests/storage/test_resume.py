@@ -211,6 +211,7 @@ def cut(path):
 RECEIPT = ".build/train-00000-of-00001.json"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "damage"),
     [

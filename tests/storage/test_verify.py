@@ -64,6 +64,7 @@ def test_flipped_byte_in_a_shard(copied, share, capsys):
     assert "1 finding(s)" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     ["README.md", "test/dataset_info.json", "meshes/mug.ply"],

@@ -89,6 +89,7 @@ def test_what_a_training_leaves(uninterrupted, trained):
     assert trained(uninterrupted.weights.parent) == uninterrupted
 
 
+@pytest.mark.long
 def test_the_same_bits_again(uninterrupted, tmp_path, trained):
     again = trained(tmp_path / "run")
     assert again.weights.read_bytes() == uninterrupted.weights.read_bytes()
@@ -126,6 +127,7 @@ def test_killed_and_resumed_is_uninterrupted(
     assert curve_of(resumed) == curve_of(uninterrupted)
 
 
+@pytest.mark.long
 def test_a_gan_paused_is_the_same_too(tmp_path, trained):
     recipe = small("architecture/pix2pix", max_epochs=2, options={"levels": 4})
     whole = trained(tmp_path / "whole", recipe)
@@ -181,6 +183,7 @@ terms, rounded to 6e-8 each and added up in another order, differ by about 6e-8 
 the output's scale a layer."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
 def test_the_validation_score_is_the_evaluators(tiny, tmp_path, normalisation, trained):
     recipe = small(f"normalization/{normalisation}", max_epochs=1, validation_pairs=None)

@@ -133,6 +133,7 @@ def test_nothing_is_said_on_data_of_the_users_own(opened):
     assert training_data_warning(config, replace(opened.manifest, origin="imported")) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "method"),
     [("predict", "network"), ("time", "fringe-net"), ("predict", "classical")],
