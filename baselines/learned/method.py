@@ -18,6 +18,7 @@ from fpp_ml_bench.baselines.phase.method import (
     AUDITED,
     RANGE_AND_WALL,
     RouteMethod,
+    audited_words,
     crossed_image,
     frames_of,
     fringe_assumption,
@@ -138,6 +139,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         return (
             f"{cls.name}, 1 "
             f"{submission.settings['fringes']}{pitch_words(submission.settings, ', ')}"
+            f"{audited_words(submission.settings)}"
         )
 
     @classmethod

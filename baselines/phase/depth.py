@@ -449,8 +449,9 @@ def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMe
     absolute = np.where(on_object, phases, np.nan) + layer.infinity_rad + TAU * layer.infinity_order
     order = np.rint(absolute / TAU)
     phase = (absolute - TAU * order).astype(np.float32)
+    depth_mm = np.zeros(phases.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth_mm = layer.depth_of_residual_mm(phases)
+        depth_mm[on_object] = layer.at(on_object).depth_of_residual_mm(phases[on_object])
     return FringeMeasurement.of(
         _restored(model, measured, inside, depth_mm, on_object, nearest),
         wrapped_phase_rad=phase,

@@ -47,6 +47,9 @@ all."""
 RESAMPLED_JUMP_RAD = 1.0
 """Difference of residual phase from which on a pixel lies beside a jump, and nothing is
 interpolated."""
+SETTLED_RAD = 1e-9
+"""Change in rad below which the iteration that removes the projector's distortion ends: a millionth
+of what float32 keeps of a depth."""
 CLIPPED_SHARE = 0.1
 """Of an averaged pixel: what makes it saturated."""
 BEST_PX = 22.56
@@ -203,11 +206,16 @@ class CalibrationLayer:
         ideal = residual_rad
         if self.lens is not None:
             for _ in range(FIXED_POINT_STEPS):
-                ideal = residual_rad - self._lens_shift(
-                    (self.gain / ideal - self.back_m) / self.forward
-                )
+                before = ideal
+                z = (self.gain / ideal - self.back_m) / self.forward
+                ideal = residual_rad - self._lens_shift(z)
+                if not (abs(ideal - before) > SETTLED_RAD).any():
+                    break
         return (self.gain / ideal - self.back_m) / self.forward * MM_PER_M
 
+    # In the plane of the projector's centre a point has no image: what follows is no number, and out
+    # of the range.
+    @np.errstate(divide="ignore", invalid="ignore", over="ignore")
     def _lens_shift(self, z: Any) -> Any:
         """Phase by which the projector's lens displaces a point at z metres on the ray."""
         x, y, ahead = (z * ray + t for ray, t in zip(self.rays, self.translation_m, strict=True))

@@ -96,6 +96,11 @@ AUDITED = ", its calibration audited"
 """End of the title of a method with ``--audit``."""
 
 
+def audited_words(settings: Mapping[str, Any]) -> str:
+    """What a short name says of the audit."""
+    return ", audited" if settings.get("audit") else ""
+
+
 @dataclass(frozen=True)
 class CrossedOptions:
     """Options of `CrossedMethod`."""
@@ -364,7 +369,8 @@ class CrossedMethod(RouteMethod[Measurement]):
         if not submission.name.startswith("Crossed fringes "):
             return None
         count = len(submission.frames_used)
-        return f"Crossed, {count} frame{'s' * (count > 1)}" if count != 2 else "Crossed, mean of 2"
+        frames = "mean of 2" if count == 2 else f"{count} frame{'s' * (count > 1)}"
+        return f"Crossed, {frames}{audited_words(submission.settings)}"
 
     def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         images = super().images(frames)

@@ -287,7 +287,8 @@ def blocks(groups: Sequence[Group]) -> list[dict[str, Any]]:
         of_data = list(members)
         key, drawn_groups = of_data[0].key, of_one_target(of_data)
         rows = [row for group in drawn_groups for row in group.rows]
-        name = key.benchmark.name if key.benchmark is not None else data.split(", ")[0]
+        other = f"real light, {key.real}" if key.real else data.partition(", ")[0]
+        name = other if key.benchmark is None else key.benchmark.name
         numbered = [(n, row.short_name, slug(row.entry)) for n, row in enumerate(rows, start=1)]
         datasets.append(
             {
