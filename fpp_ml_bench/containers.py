@@ -91,11 +91,13 @@ _idle: dict[int, list[ReadingProcess]] = {}
 """Processes that wait for a file, by the process that started them: a fork must not share them."""
 
 
-def guarded(read: Callable[..., Answer], content: bytes, largest: int, **arguments: Any) -> Answer:
-    """``read(content, largest, **arguments)`` in a process that may end. PredictionError as it
-    raises, and where the process ended, took too long, or needs more memory than a few times
-    ``largest`` bytes."""
-    name = f"{read.__module__}:{read.__name__}"
+def guarded(
+    read: Callable[..., Answer] | str, content: bytes, largest: int, **arguments: Any
+) -> Answer:
+    """``read(content, largest, **arguments)`` in a process that may end: a function, or its name as
+    module:function. PredictionError as it raises, and where the process ended, took too long, or
+    needs more memory than a few times ``largest`` bytes."""
+    name = read if isinstance(read, str) else f"{read.__module__}:{read.__name__}"
     waiting = _idle.setdefault(os.getpid(), [])
     try:
         process = waiting.pop()

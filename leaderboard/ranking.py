@@ -118,10 +118,13 @@ class GroupKey:
 
     @property
     def special_data(self) -> str:
-        """What sets a benchmark apart from those that are shown first, in words: another light or a
-        small image, as ``workshop``, ``224 px``; empty for the others."""
+        """What sets data apart from those that are shown first, in words: the set of real
+        captures, another light or a small image, as ``workshop``, ``224 px``; empty for the
+        others."""
         benchmark = self.benchmark
-        if benchmark is None or (benchmark.light == "paper" and benchmark.size == FULL_SIZE):
+        if benchmark is None:
+            return self.real or ""
+        if benchmark.light == "paper" and benchmark.size == FULL_SIZE:
             return ""
         words = [benchmark.light, f"{benchmark.size} px"]
         return ", ".join(

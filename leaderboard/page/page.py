@@ -287,8 +287,7 @@ def blocks(groups: Sequence[Group]) -> list[dict[str, Any]]:
         of_data = list(members)
         key, drawn_groups = of_data[0].key, of_one_target(of_data)
         rows = [row for group in drawn_groups for row in group.rows]
-        other = f"real light, {key.real}" if key.real else data.partition(", ")[0]
-        name = other if key.benchmark is None else key.benchmark.name
+        name = key.benchmark.name if key.benchmark is not None else data.split(", ")[0]
         numbered = [(n, row.short_name, slug(row.entry)) for n, row in enumerate(rows, start=1)]
         datasets.append(
             {
