@@ -128,15 +128,13 @@ class Finding:
 
 class Probe(ABC):
     """A test of a model. ``version`` goes up when its result for the same model changes.
-    ``without_network``: what a method without a network lacks for this probe, or None.
-    ``asks_subject``: whether the result is about the model."""
+    ``without_network``: what a method without a network lacks for this probe, or None."""
 
     name: str
     title: str
     question: str
     version = 1
     without_network: str | None = None
-    asks_subject = True
 
     def applies_to(self, subject: Subject) -> str | None:
         """None where the probe can run, else the reason why it can't, for the report."""
@@ -156,7 +154,6 @@ PROBES = {
     "grad-cam": "GradCam",
     "flat-plane": "FlatPlane",
     "counterfactual": "Counterfactual",
-    "theory": "Theory",
     "identifiability": "Identifiability",
 }
 """The probes in the order of the report, and their classes; each is in the module of its name,
@@ -206,9 +203,7 @@ def diagnose(
                 results.append(ProbeResult(probe, *stored, reused=True))
             elif name in probe_names:
                 started = perf_counter()
-                if reason := probe.applies_to(subject) or (
-                    nothing() if probe.asks_subject else None
-                ):
+                if reason := probe.applies_to(subject) or nothing():
                     finding = Finding(skipped=reason)
                 else:
                     finding = probe.run(subject, dataset, settings, progress(probe))

@@ -1,12 +1,7 @@
-"""The networks by name, a trained one ready to use (fringe image in, depth in mm out), and networks
-as ONNX files."""
+"""The networks by name, and a trained one ready to use: fringe image in, depth in mm out."""
 
-import importlib.util
 import inspect
-import tempfile
-import warnings
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +18,7 @@ from fpp_ml_bench.baselines.networks.unet import ResUNet, TransUNet, UNet
 from fpp_ml_bench.baselines.training.weights import ModelConfig, open_weights, weights_path
 from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.depth import denormalise
-from fpp_ml_bench.errors import FppBenchError, NetworkError, PredictionError, WeightsError
+from fpp_ml_bench.errors import NetworkError, PredictionError, WeightsError
 from fpp_ml_bench.loaders.training import unit_range
 
 _CLASSES: dict[str, type[FringeNetwork]] = {
@@ -184,60 +179,3 @@ def _device(name: str | None) -> torch.device:
         raise WeightsError(
             f"device {name!r} can't be used here: {str(error).splitlines()[0]}; give cpu"
         ) from None
-
-
-INPUT = "fringe"
-OUTPUT = "depth_representation"
-OPSET = 17
-"""Of the ONNX file: its input, its output, its version of the operators."""
-
-
-def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Path:
-    """Write a network as an ONNX file in float32, and return its path.
-
-    The file takes ``fringe`` float32 (B, 1, H, W) in [0, 1] and gives ``depth_representation`` of
-    the same shape; B is free, H and W are ``size`` (one number for a square). ``model``: a
-    `FringeNetwork`, or what holds one as ``.network``. Torch's older exporter takes 0.4 to 2 s
-    where the newer takes 6 to 30 s, to the same numbers. Raises `FppBenchError` where the onnx
-    package is missing or the file can't be written, and `NetworkError` for something that is no
-    network or a size that it does not take."""
-    if importlib.util.find_spec("onnx") is None:
-        raise FppBenchError(
-            'ONNX export needs the onnx package; install it with: pip install "fpp-ml-bench[onnx]"'
-        )
-    network = model if isinstance(model, FringeNetwork) else getattr(model, "network", None)
-    if not isinstance(network, FringeNetwork):
-        raise NetworkError(
-            f"expected a network or a model that holds one; it was given {type(model).__name__}"
-        )
-    height, width = (size, size) if isinstance(size, int) else size
-    network.check_size(height, width)
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise FppBenchError(
-            f"can't write {target}: there is no folder {target.parent}; make it first"
-        )
-    example = torch.zeros(
-        1, 1, height, width, dtype=torch.float32, device=next(network.parameters()).device
-    )
-    try:
-        # A file that appears under its name only when whole.
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".onnx-") as folder:
-            unfinished = Path(folder) / target.name
-            with warnings.catch_warnings():
-                # The size rule is checked once, here, and is meant to be a constant of the file.
-                warnings.simplefilter("ignore")
-                torch.onnx.export(
-                    deepcopy(network).eval().float(),
-                    (example,),
-                    str(unfinished),
-                    dynamo=False,
-                    input_names=[INPUT],
-                    output_names=[OUTPUT],
-                    dynamic_axes={INPUT: {0: "batch"}, OUTPUT: {0: "batch"}},
-                    opset_version=OPSET,
-                )
-            unfinished.replace(target)
-    except OSError as error:
-        raise FppBenchError(f"can't write {target}: {error.strerror or error}") from error
-    return target

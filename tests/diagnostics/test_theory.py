@@ -1,23 +1,19 @@
 """The two theorems: frames that are the same bytes at two depths, and exponents against closed
 forms."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
 from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer
-from fpp_ml_bench.baselines.diagnostics.theory import (
-    DISTANCES_M,
-    Theory,
-    depth_error_mm,
-    exponent,
-    kappa_per_m,
-    twins_of,
-)
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.optics.named_rigs import paper_rig
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from theory import DISTANCES_M, depth_error_mm, exponent, kappa_per_m, main, twins_of
 
 
 @pytest.mark.parametrize("direction, other_frame", [("horizontal", 18), ("vertical", 0)])
@@ -73,9 +69,10 @@ def test_the_exponent_is_two_where_the_mistake_is_small_and_the_baseline_thin():
     assert exponent(behind, "horizontal", 0.5, 1 / 64) == pytest.approx(2 * 0.5 / 0.6, rel=0.01)
 
 
-def test_the_probe_needs_no_model(opened):
-    finding = Theory().run(None, opened, ProbeSettings(), silent)
-    assert Theory().applies_to(None) is None
-    assert finding.values["twins"]["differing_pixels"] == 0
-    assert len(finding.figure.png) > 5000
-    assert "0 of the image's pixels differ" in finding.summary
+def test_the_script_says_both(opened, tmp_path, monkeypatch, capsys):
+    drawn = tmp_path / "twins.png"
+    monkeypatch.setattr(sys, "argv", ["theory.py", str(opened.path), "--picture", str(drawn)])
+    assert main() == 0
+    said = capsys.readouterr().out
+    assert "fringe: 0 of " in said and "| a period, away | 1.8 |" in said
+    assert drawn.stat().st_size > 5000

@@ -1,5 +1,7 @@
-"""The paper's two theorems (Section 4.2), checked numerically (docs/phase_and_order.md); the
-subject is not used.
+"""The paper's two theorems (Section 4.2), checked numerically (docs/phase_and_order.md).
+
+    python benchmarks/theory.py data/small224
+    python benchmarks/theory.py data/small224 --picture twins.png
 
 *A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same
 frame of that direction, noise included, if at each pixel the brighter one gets a lower albedo (in
@@ -8,38 +10,27 @@ costs Z^2*, and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for
 kappa = P / (f_p b).
 """
 
+import argparse
+import sys
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    Figure,
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    table_of,
-    with_interval,
-)
 from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer, constant, moved, original
-from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.baselines.phase.geometry import CalibrationLayer
+from fpp_ml_bench.constants import MM_PER_M, TAU
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 from fpp_ml_bench.style import DEPTH_COLOURS, Picture, gallery
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+from fpp_ml_bench.tables import Table
 
 DISTANCES_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
 """Distances of the object in m at which theory is compared with the rig: from much nearer to much
 farther than the paper's 1.8 m."""
-SHOWN_M = 1.8
-"""Distance in m that the summary shows: the paper's standoff, 1.8 m."""
 SMALL_PERIODS = 1 / 64
 """An error so small, in periods, that the linear model holds over all distances."""
 ERRORS_PERIODS = {"1/64 period": SMALL_PERIODS, "a period, away": 1.0, "a period, toward": -1.0}
@@ -49,64 +40,6 @@ position."""
 _STEP = 1e-4
 """Relative step of the distance in a difference quotient: far above rounding, far below what
 changes the slope."""
-
-
-class Theory(Probe):
-    """Both theorems on the dataset's rig."""
-
-    name = "theory"
-    title = "Theory in numbers"
-    asks_subject = False
-    version = 2
-    question = (
-        "Can two depths give the same fringe, and how large is the depth error of one period at "
-        "each distance?"
-    )
-
-    def run(
-        self,
-        subject: "Subject",
-        dataset: DatasetFolder,
-        settings: ProbeSettings,
-        progress: Progress,
-    ) -> Finding:
-        progress(0, 2, "two scenes, one frame")
-        twins = twins_of(dataset, SceneRenderer.of(dataset))
-        progress(1, 2, "one period, many distances")
-        laws: list[dict[str, Any]] = [
-            {
-                "error": name,
-                "distance_m": distance_m,
-                "error_mm": depth_error_mm(dataset.rig, twins.direction, distance_m, periods),
-                "exponent": exponent(dataset.rig, twins.direction, distance_m, periods),
-            }
-            for name, periods in ERRORS_PERIODS.items()
-            for distance_m in DISTANCES_M
-        ]
-        facts = twins.to_dict()
-        small, away, toward = (
-            with_interval(row["exponent"]) for row in laws if row["distance_m"] == SHOWN_M
-        )
-        summary = (
-            f"{twins.sample} and a surface {facts['depth_apart_mean_mm']:.0f} mm from it on "
-            f"average give the same "
-            f"{twins.direction} fringe: {facts['differing_pixels']} of the image's pixels differ "
-            f"(the frame of the "
-            f"other direction: {facts['differing_pixels_other_direction']}). At {SHOWN_M:g} m the "
-            f"depth error of a "
-            f"small phase error grows with exponent {small} of distance, that of a whole period "
-            f"with {away} away from "
-            f"the camera and {toward} toward it."
-        )
-        values = {
-            "twins": facts,
-            "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "laws": laws,
-        }
-        rows = {f"{row['error']}, {row['distance_m']:g} m": row for row in laws}
-        columns = {"error_mm": "Depth error, mm", "exponent": "Local exponent of distance"}
-        table = table_of("Depth error of a phase error by distance", "Phase error", rows, columns)
-        return Finding(summary, values, table, _draw_twins(twins))
 
 
 @dataclass(frozen=True)
@@ -124,18 +57,16 @@ class Twins:
     other_frames: NDArray[np.uint8]
     paint: NDArray[np.float64]
 
-    def to_dict(self) -> dict[str, Any]:
+    def describe(self) -> str:
+        """A sentence with how far the scenes are apart and how many pixels tell them apart."""
         inside = self.depths_mm[0] > 0
-        return {
-            "sample": self.sample,
-            "direction": self.direction,
-            "frame": self.frame,
-            "object_pixels": int(inside.sum()),
-            "differing_pixels": int(np.not_equal(*self.frames).sum()),
-            "differing_pixels_other_direction": int(np.not_equal(*self.other_frames).sum()),
-            "depth_apart_mean_mm": float(np.abs(np.subtract(*self.depths_mm))[inside].mean()),
-            "paint_least": float(self.paint.min()),
-        }
+        apart_mm = np.abs(np.subtract(*self.depths_mm))[inside].mean()
+        told, told_across = (np.not_equal(*pair).sum() for pair in (self.frames, self.other_frames))
+        return (
+            f"{self.sample} and a surface {apart_mm:.0f} mm from it on average give the same "
+            f"{self.direction} fringe: {told} of {inside.size} pixels differ, and {told_across} "
+            f"in the frame of the other direction ({inside.sum()} show the object)"
+        )
 
 
 def twins_of(
@@ -220,7 +151,8 @@ def exponent(rig: Rig, direction: Direction, distance_m: float, periods: float) 
     return float(np.log(high / low) / np.log((1 + _STEP) / (1 - _STEP))) if low and high else None
 
 
-def _draw_twins(twins: Twins) -> Figure:
+def picture(twins: Twins) -> bytes:
+    """Both scenes' frames and depths as a PNG file."""
     inside = twins.depths_mm[0] > 0
     low, high = twins.depths_mm[:, inside].min(), twins.depths_mm[:, inside].max()
     pairs = {f"{twins.direction} fringe": twins.frames, "other direction": twins.other_frames}
@@ -232,5 +164,32 @@ def _draw_twins(twins: Twins) -> Figure:
         Picture(np.where(inside, depth, np.nan), DEPTH_COLOURS, low, high)
         for depth in twins.depths_mm
     ]
-    alt = "Two depths a period apart and their identical fringes"
-    return Figure("Two scenes, one frame", alt, gallery(rows, ("scene A", "scene B"), 2.2))
+    return gallery(rows, ("scene A", "scene B"), 2.2)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--picture", type=Path, help="draw both scenes into this PNG file")
+    args = parser.parse_args()
+    dataset = DatasetFolder(args.dataset)
+    twins = twins_of(dataset, SceneRenderer.of(dataset))
+    print(twins.describe())
+    print(f"kappa: {kappa_per_m(dataset.rig, twins.direction):.4f} per metre")
+    table = Table("Phase error", numbers=("Distance, m", "Depth error, mm", "Local exponent"))
+    for name, periods in ERRORS_PERIODS.items():
+        for distance_m in DISTANCES_M:
+            asked = dataset.rig, twins.direction, distance_m, periods
+            numbers = depth_error_mm(*asked), exponent(*asked)
+            cells = ["-" if one is None else f"{one:.4g}" for one in numbers]
+            table.add_row(name, f"{distance_m:g}", *cells)
+    print("\n".join(table.markdown()))
+    if args.picture:
+        args.picture.write_bytes(picture(twins))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
