@@ -117,6 +117,7 @@ CROSSED = {
     "crossed": "crossed",
     "crossed-03": "crossed --frames 3",
     "fringe-net-crossed": "fringe-net --fringes crossed",
+    "fringe-net-crossed-even": "fringe-net --fringes crossed --even-odds",
 }
 """The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be
 the same rows."""

@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 NETWORKS = ("fringe-net-42", "fringe-net-1", "fringe-net-2")
 """Weights of the networks that come with the package."""
 MEMBERS = len(NETWORKS)
+EVENLY = ", even odds"
+"""End of the title and the short name of a method with ``--even-odds``."""
+UNLESS_TAKEN = "audit", "anyway", "even_odds"
+"""Options that the settings name only where they are taken."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,11 @@ class FringeNetOptions:
     )
     audit: bool = option(False, AUDIT)
     anyway: bool = option(False, ANYWAY)
+    even_odds: bool = option(
+        False,
+        "leave out pixels that are as likely wall as object: a third of the invented pixels, "
+        "more missed ones (default: miss few)",
+    )
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     threads: int = 1
 
@@ -139,6 +148,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         return (
             f"{cls.name}, 1 "
             f"{submission.settings['fringes']}{pitch_words(submission.settings, ', ')}"
+            f"{EVENLY if submission.settings.get('even_odds') else ''}"
             f"{audited_words(submission.settings)}"
         )
 
@@ -149,7 +159,13 @@ class FringeNetMethod(RouteMethod[Measurement]):
         )
 
     def __init__(self, rig: Rig, **options: Any) -> None:
-        from fpp_ml_bench.baselines.learned.fringe_net import Fringes, LinePart, PairPart
+        from fpp_ml_bench.baselines.learned.fringe_net import (
+            EVEN,
+            WIDE,
+            Fringes,
+            LinePart,
+            PairPart,
+        )
         from fpp_ml_bench.baselines.learned.network import SHIPPED, load_net
         from fpp_ml_bench.baselines.learned.warp import Warp, signs_of, steps_and_signs
         from fpp_ml_bench.baselines.training.weights import WeightsFile, shipped_names
@@ -176,6 +192,7 @@ class FringeNetMethod(RouteMethod[Measurement]):
         self.parameters = sum(p.numel() for network in networks for p in network.parameters())
         self.rig, self.threads = rig, given.threads
         own = Settings(min_confidence=given.min_confidence)
+        limits = EVEN if given.even_odds else WIDE
         other_pitch: dict[str, float] = {}
         audited: dict[str, bool] = {}
         if (given.audit or given.anyway) and not crossed:
@@ -184,13 +201,13 @@ class FringeNetMethod(RouteMethod[Measurement]):
             self.frames_used = frames_of(rig, f"{self.name} --fringes crossed")
             pair = TwoCarriers(rig, own)
             carriers = pair.carriers
-            both = Fringes(networks, Warp.of(carriers.step_rad, signs_of(carriers.gain)))
+            both = Fringes(networks, Warp.of(carriers.step_rad, signs_of(carriers.gain)), limits)
             self.route = route = two_carriers(pair, PairPart(both).before, PairPart.after)
             audited = self.use_audit(route, given.audit, given.anyway)
         else:
             other_pitch = pitch_setting(rig, way)
             model = OneCarrier(rig, Settings(way, min_confidence=given.min_confidence))
-            line = Fringes(networks, Warp.of(*steps_and_signs(model.rig, model.layer)))
+            line = Fringes(networks, Warp.of(*steps_and_signs(model.rig, model.layer)), limits)
             self.route = one_carrier(model, LinePart(line, model).before, LinePart.after)
             self.frames_used = (rig.sequence.sinusoids(way)[0],)
             self.caution = model.caution
@@ -198,10 +215,11 @@ class FringeNetMethod(RouteMethod[Measurement]):
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
         frame = f"one {fringes} frame{pitch_words(other_pitch)}"
         self.title = f"Wrapped phase and mask of {frame} by {count}; order measured{more}"
-        self.title += AUDITED if audited else ""
+        self.title += (EVENLY if given.even_odds else "") + (AUDITED if audited else "")
         hashes = [file.sha256 for file in files]
         self.settings = {
-            **{key: value for key, value in vars(given).items() if key not in ("audit", "anyway")},
+            **{key: value for key, value in vars(given).items() if key not in UNLESS_TAKEN},
+            **({"even_odds": True} if given.even_odds else {}),
             **audited,
             "weights": config.name,
             "weights_sha256": hashes[0]

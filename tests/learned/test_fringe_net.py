@@ -155,3 +155,21 @@ def test_the_shipped_networks_answer_for_any_rig() -> None:
     assert pair.frames_used == (0, 18)  # whose mean is a crossed frame
     with pytest.raises(PredictionError, match="expected 1 to"):
         FringeNetMethod.for_rig(rig, members=9)
+
+
+def test_even_odds_leave_out_what_may_be_wall() -> None:
+    rig = RIGS["crossed"]
+    frame = rig.sequence.crossed_frames[0]
+    images, depth_mm, flags = photographed(
+        Studio(BuildSettings(rig, ("mug",))), "mug", "A0", (frame,)
+    )
+    frames = [images[0] if number == frame else None for number in range(len(rig.sequence))]
+    wide, even = (
+        FringeNetMethod.for_rig(rig, members=1, even_odds=chosen) for chosen in (False, True)
+    )
+    answered, left = (method.answer(frames).depth > 0 for method in (wide, even))
+    empty = (depth_mm == 0) & ((flags & VOID) == 0)
+    assert not (left & ~answered).any() and left.sum() > 0.98 * answered.sum()
+    assert (left & empty).sum() < 0.7 * (answered & empty).sum()
+    assert "even_odds" not in wide.settings and even.settings["even_odds"]
+    assert even.title == wide.title + ", even odds"
