@@ -52,8 +52,8 @@ and a missed pixel is off by its whole depth: the object's MAE was 1.18 mm and i
 EVEN = 0.0, 3.0
 """The same where a pixel that is as likely wall as object is left out, so that the fewest pixels
 are wrong, missed or invented. On validation views before the paper's rig and eight drawn ones,
-missed and invented in `paper`: 0.12% and 0.12%, 0.48% and 0.38%; in `workshop`: 0.31% and 0.34%,
-0.59% and 0.96%. `WIDE` there: 0.003% and 0.39%, 0.13% and 1.3%; 0.10% and 1.3%, 0.06% and 3.9%."""
+missed and invented in `paper`: 0.10% and 0.12%, 0.25% and 0.38%; in `workshop`: 0.18% and 0.39%,
+0.38% and 1.0%. `WIDE` there: 0.003% and 0.39%, 0.006% and 1.3%; 0.04% and 1.5%, 0.04% and 4.1%."""
 AVERAGE_PERIODS, AVERAGE_RAD = 0.2, 0.3
 """Sigmas over which the phase is averaged once its order is chosen (bilateral filter): across the
 image in periods of the longer carrier, and between phases, so that surfaces apart stay apart. What a
