@@ -8,12 +8,12 @@ With all steps and both directions it is the process that made the ``depth`` col
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import index
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Answer, Frames, Method, Photographed
+from fpp_ml_bench.baselines.method import Answer, Frames, Method, Photographed, Setting
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.blocks import plan_direction
 from fpp_ml_bench.decoding.decode import Decoded, Directions, decode_stack
@@ -72,12 +72,13 @@ class ClassicalMethod(Method):
     that were not captured, and for ``steps`` or ``fewest`` with another kind, and `PredictionError`
     for ``depth_noise``, which needs a dataset."""
 
+    options: ClassicalOptions
     name = "classical"
     purpose = "N-step phase, Gray-code order, triangulation"
     Options = ClassicalOptions
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
-        self.options = self.checked_options(options)
+    def __init__(self, rig: Rig, **options: object) -> None:
+        self.options = self.checked_options(ClassicalOptions, options)
         direction, steps, fewest = self.options.direction, self.options.steps, self.options.fewest
         threads = self.options.threads
         if self.options.depth_noise is not None:
@@ -115,15 +116,17 @@ class ClassicalMethod(Method):
             self.settings = {**self.settings, "fewest": True}
 
     @classmethod
-    def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
+    def for_dataset(cls, dataset: Photographed, **options: object) -> Method:
         """With the steps that ``depth_noise`` mm takes, by the light and the camera that the
         dataset was built with."""
-        if (depth_noise_mm := options.pop("depth_noise", None)) is not None:
-            options["steps"] = _steps_for(dataset, depth_noise_mm, options)
-        return cls.for_rig(dataset.rig, **options)
+        given = cls.checked_options(ClassicalOptions, options)
+        if given.depth_noise is None:
+            return cls.for_rig(dataset.rig, **options)
+        steps = _steps_for(dataset, given.depth_noise, given)
+        return cls.for_rig(dataset.rig, **{**options, "depth_noise": None, "steps": steps})
 
     @classmethod
-    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Setting]]:
         if not isinstance(rig.sequence, FrameSequence):
             return [{}] if rig.directions else []
         both = [{"steps": steps} for steps in (3, 4, 6, 9, rig.sequence.steps)]
@@ -175,11 +178,11 @@ class ClassicalMethod(Method):
         return Answer(decoded.depth_mm, sigma_mm)
 
 
-def _steps_for(dataset: Photographed, depth_noise_mm: float, options: Mapping[str, Any]) -> int:
+def _steps_for(dataset: Photographed, depth_noise_mm: float, given: ClassicalOptions) -> int:
     """The fewest steps whose depth noise at the far end of the working range is at most
     ``depth_noise_mm``."""
     described = dataset.manifest.settings.get("light")
-    if options.get("steps") is not None or not 0 < depth_noise_mm < float("inf"):
+    if given.steps is not None or not 0 < depth_noise_mm < float("inf"):
         raise PredictionError(
             f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps"
         )
@@ -191,8 +194,7 @@ def _steps_for(dataset: Photographed, depth_noise_mm: float, options: Mapping[st
     far_mm = dataset.rig.working_range_mm[1]
     modulation = modulation_at(dataset.rig, far_mm, light)
     noise_grey = fringe_noise_at(dataset.rig, far_mm, light)
-    direction = options.get("direction", "both")
-    steps = fewest_steps(dataset.rig, direction, depth_noise_mm, modulation, noise_grey)
+    steps = fewest_steps(dataset.rig, given.direction, depth_noise_mm, modulation, noise_grey)
     if steps is None:
         raise PredictionError(
             f"--depth-noise {depth_noise_mm:g}: more noise remains even with all "

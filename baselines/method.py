@@ -21,7 +21,7 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,8 @@ from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import did_you_mean
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from fpp_ml_bench.baselines.training.weights import ModelConfig, NetConfig, TrainingBenchmark
     from fpp_ml_bench.evaluation.submission.description import Submission
     from fpp_ml_bench.loaders.storage.benchmark import Benchmark
@@ -56,6 +58,7 @@ FRAMEWORKS = (
 """Modules whose versions are stated of a method of a file where they are loaded: nobody has to say
 so."""
 Setting = str | int | float | bool | None
+OptionsT = TypeVar("OptionsT", bound="DataclassInstance")
 
 
 class Photographed(Protocol):
@@ -128,10 +131,11 @@ class Method:
 
     name: str
     purpose: ClassVar[str] = ""
-    Options: ClassVar[type] = NoOptions
+    Options: "ClassVar[type[DataclassInstance]]" = NoOptions
     Training: ClassVar[type | None] = None
     trivial: ClassVar[bool] = False
 
+    options: "DataclassInstance"
     title: str
     frames_used: tuple[int, ...]
     settings: Mapping[str, Setting] = MappingProxyType({})
@@ -152,10 +156,10 @@ class Method:
     reports: bool = False
     caution: str = ""
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
+    def __init__(self, rig: Rig, **options: object) -> None:
         """For images of ``rig``; ``options`` are the fields of `Options`, and become the settings
         of its submission. `PredictionError` for an option that it does not have."""
-        self.rig, self.options = rig, self.checked_options(options)
+        self.rig, self.options = rig, self.checked_options(self.Options, options)
         # A submission states a path as text.
         given = {
             key: str(value) if isinstance(value, Path) else value
@@ -164,24 +168,24 @@ class Method:
         self.settings = {**self.settings, **given}
 
     @classmethod
-    def checked_options(cls, given: Mapping[str, Any]) -> Any:
-        """`Options` with the values ``given``, by name. `PredictionError` for a name that it does
-        not have."""
-        known = [entry.name for entry in fields(cls.Options)]
+    def checked_options(cls, make: "type[OptionsT]", given: Mapping[str, object]) -> "OptionsT":
+        """The dataclass ``make``, `Options` as a rule, with the values ``given``, by name.
+        `PredictionError` for a name that it does not have."""
+        known = [entry.name for entry in fields(make)]
         for name in given:
             if name not in known:
                 hint = did_you_mean(name, known) if known else "it has none"
                 raise PredictionError(f"{cls.name}: has no option {name}; {hint}")
-        return cls.Options(**given)
+        return make(**given)
 
     @classmethod
-    def for_rig(cls, rig: Rig, **options: Any) -> "Method":
+    def for_rig(cls, rig: Rig, **options: object) -> "Method":
         """The method for images of ``rig``. A class that makes another one for some options
         overrides this."""
         return cls(rig, **options)
 
     @classmethod
-    def for_dataset(cls, dataset: "Photographed", **options: Any) -> "Method":
+    def for_dataset(cls, dataset: "Photographed", **options: object) -> "Method":
         """The method for a dataset. A class that needs more of it than the rig (its training split,
         the light it was built with) overrides this."""
         return cls.for_rig(dataset.rig, **options)
@@ -194,13 +198,13 @@ class Method:
         raise PredictionError(f"{cls.name}: there is nothing to train")
 
     @classmethod
-    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Setting]]:
         """The options with which ``fpp-bench tradeoff`` measures it on ``rig``; none for a rig that
         it can't be for."""
         return [{}]
 
     @classmethod
-    def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
+    def scenes_rig(cls, settings: Mapping[str, Setting]) -> str:
         """Which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench
         robustness``, with these ``settings`` (an option that is not given may be missing)."""
         return "paper"
@@ -212,7 +216,7 @@ class Method:
         return None
 
     @classmethod
-    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+    def assumption(cls, settings: Mapping[str, Setting]) -> Assumption | None:
         """What it assumes of every scene with these settings; None where it assumes nothing."""
         return None
 

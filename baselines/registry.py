@@ -124,7 +124,7 @@ def find(name: str | Path, trust: bool = False) -> Found:
 
 
 def load_method(
-    name: str | Path, source: Photographed | Rig, *, trust: bool = False, **options: Any
+    name: str | Path, source: Photographed | Rig, *, trust: bool = False, **options: object
 ) -> Method:
     """The method that ``name`` means (see `find`), for a dataset, or for images of a rig.
 

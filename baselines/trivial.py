@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Frames, Method, Photographed, training_split_of
+from fpp_ml_bench.baselines.method import Frames, Method, Photographed, Setting, training_split_of
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import depth_range_mm, object_mask
 from fpp_ml_bench.errors import PredictionError
@@ -55,8 +55,8 @@ class ConstantMethod(Method):
     trivial = True
     packages = ("numpy",)
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
-        at = self.checked_options(options).at
+    def __init__(self, rig: Rig, **options: object) -> None:
+        at = self.checked_options(ConstantOptions, options).at
         known = {
             STANDOFF: rig.standoff_m * MM_PER_M,
             MIDDLE: sum(rig.working_range_mm) / 2,
@@ -85,7 +85,7 @@ class ConstantMethod(Method):
         self.settings = {"at": at, "share" if at in RANGE_SHARES else "depth_mm": self.value}
 
     @classmethod
-    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Setting]]:
         return [{}, {"at": TRAINING_MEAN}]
 
     @property
@@ -142,13 +142,13 @@ class NearestMethod(Method):
     packages = ("numpy",)
 
     @classmethod
-    def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
+    def for_dataset(cls, dataset: Photographed, **options: object) -> Method:
         """With the dataset's own training split, unless another dataset's is given."""
         own = {"training": dataset} if isinstance(dataset, DatasetFolder) else {}
         return cls.for_rig(dataset.rig, **{**own, **options})
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
-        training = self.checked_options(options).training
+    def __init__(self, rig: Rig, **options: object) -> None:
+        training = self.checked_options(NearestOptions, options).training
         if training is None:
             raise PredictionError(
                 f"{self.name} needs the training split: give the dataset that holds it (--training "

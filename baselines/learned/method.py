@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Assumption, Frames
+from fpp_ml_bench.baselines.method import Assumption, Frames, Setting
 from fpp_ml_bench.baselines.phase.depth import Measurement
 from fpp_ml_bench.baselines.phase.method import (
     ANYWAY,
@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.phase.method import (
     crossed_image,
     frames_of,
     fringe_assumption,
-    fringe_options,
+    fringe_direction,
     pitch_setting,
     pitch_words,
 )
@@ -32,7 +32,6 @@ from fpp_ml_bench.baselines.phase.settings import MIN_CONFIDENCE, Settings
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
@@ -44,8 +43,6 @@ NETWORKS = ("fringe-net-42", "fringe-net-1", "fringe-net-2")
 MEMBERS = len(NETWORKS)
 EVENLY = ", even odds"
 """End of the title and the short name of a method with ``--even-odds``."""
-UNLESS_TAKEN = "audit", "anyway", "even_odds"
-"""Options that the settings name only where they are taken."""
 
 
 @dataclass(frozen=True)
@@ -133,12 +130,12 @@ class FringeNetMethod(RouteMethod[Measurement]):
         return True
 
     @classmethod
-    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Setting]]:
         ways = ["crossed"] if rig.sequence.crossed_frames else rig.fringe_directions
         return [{"fringes": way} for way in ways]
 
     @classmethod
-    def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
+    def scenes_rig(cls, settings: Mapping[str, Setting]) -> str:
         return "crossed" if settings.get("fringes") == "crossed" else super().scenes_rig(settings)
 
     @classmethod
@@ -153,12 +150,12 @@ class FringeNetMethod(RouteMethod[Measurement]):
         )
 
     @classmethod
-    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+    def assumption(cls, settings: Mapping[str, Setting]) -> Assumption | None:
         return (
             RANGE_AND_WALL if settings.get("fringes") == "crossed" else fringe_assumption(settings)
         )
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
+    def __init__(self, rig: Rig, **options: object) -> None:
         from fpp_ml_bench.baselines.learned.fringe_net import (
             EVEN,
             WIDE,
@@ -170,17 +167,10 @@ class FringeNetMethod(RouteMethod[Measurement]):
         from fpp_ml_bench.baselines.learned.warp import Warp, signs_of, steps_and_signs
         from fpp_ml_bench.baselines.training.weights import WeightsFile, shipped_names
 
-        given = self.checked_options(options)
-        crossed = (
-            bool(rig.sequence.crossed_frames)
-            if given.fringes is None
-            else given.fringes == "crossed"
+        given = self.checked_options(FringeNetOptions, options)
+        fringes = given.fringes or (
+            "crossed" if rig.sequence.crossed_frames else fringe_direction(rig)
         )
-        told = {} if given.fringes is None else {"direction": given.fringes}
-        way: Direction = "horizontal"
-        if not crossed:
-            way = fringe_options(self.name, rig, told).get("direction", way)
-        fringes = "crossed" if crossed else way
         if not 1 <= given.members <= MEMBERS:
             raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
         names = [given.weights] if given.weights else list(NETWORKS)
@@ -191,25 +181,24 @@ class FringeNetMethod(RouteMethod[Measurement]):
         self.weights_config = config = files[0].config
         self.parameters = sum(p.numel() for network in networks for p in network.parameters())
         self.rig, self.threads = rig, given.threads
-        own = Settings(min_confidence=given.min_confidence)
         limits = EVEN if given.even_odds else WIDE
         other_pitch: dict[str, float] = {}
         audited: dict[str, bool] = {}
-        if (given.audit or given.anyway) and not crossed:
-            raise PredictionError(f"{self.name} --audit needs a frame of two carriers")
-        if crossed:
+        if fringes == "crossed":
             self.frames_used = frames_of(rig, f"{self.name} --fringes crossed")
-            pair = TwoCarriers(rig, own)
+            pair = TwoCarriers(rig, Settings(min_confidence=given.min_confidence))
             carriers = pair.carriers
             both = Fringes(networks, Warp.of(carriers.step_rad, signs_of(carriers.gain)), limits)
             self.route = route = two_carriers(pair, PairPart(both).before, PairPart.after)
             audited = self.use_audit(route, given.audit, given.anyway)
         else:
-            other_pitch = pitch_setting(rig, way)
-            model = OneCarrier(rig, Settings(way, min_confidence=given.min_confidence))
+            if given.audit or given.anyway:
+                raise PredictionError(f"{self.name} --audit needs a frame of two carriers")
+            other_pitch = pitch_setting(rig, fringes)
+            model = OneCarrier(rig, Settings(fringes, min_confidence=given.min_confidence))
             line = Fringes(networks, Warp.of(*steps_and_signs(model.rig, model.layer)), limits)
             self.route = one_carrier(model, LinePart(line, model).before, LinePart.after)
-            self.frames_used = (rig.sequence.sinusoids(way)[0],)
+            self.frames_used = (rig.sequence.sinusoids(fringes)[0],)
             self.caution = model.caution
         more = "" if config.name in shipped_names(SHIPPED) else f" ({config.name})"
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
@@ -218,15 +207,16 @@ class FringeNetMethod(RouteMethod[Measurement]):
         self.title += (EVENLY if given.even_odds else "") + (AUDITED if audited else "")
         hashes = [file.sha256 for file in files]
         self.settings = {
-            **{key: value for key, value in vars(given).items() if key not in UNLESS_TAKEN},
+            "fringes": fringes,
+            "members": len(networks),
+            "weights": config.name,
+            "min_confidence": given.min_confidence,
+            "threads": given.threads,
             **({"even_odds": True} if given.even_odds else {}),
             **audited,
-            "weights": config.name,
             "weights_sha256": hashes[0]
             if len(hashes) == 1
             else sha256("".join(hashes).encode()).hexdigest(),
-            "fringes": fringes,
-            "members": len(networks),
             **other_pitch,
         }
 

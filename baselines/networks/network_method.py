@@ -50,6 +50,16 @@ class NetworkOptions:
     recipe: str | None = None
 
 
+def _weights(given: NetworkOptions, size: int) -> Path:
+    """The weights file of the options, for images of ``size`` px. Raises `WeightsError` where they
+    name none."""
+    if given.recipe is not None:
+        return weights_of_recipe(given.recipe, size)
+    if given.weights is None:
+        raise WeightsError("no weights: expected a weights file, or the recipe that trained it")
+    return given.weights
+
+
 class NetworkMethod(Method):
     """A `Model` that takes one frame of the sequence.
 
@@ -67,31 +77,31 @@ class NetworkMethod(Method):
     batched = True
 
     @classmethod
-    def for_rig(cls, rig: Rig, **options: Any) -> "NetworkMethod":
+    def for_rig(cls, rig: Rig, **options: object) -> "NetworkMethod":
         """The network of a weights file, for frames in the order of ``rig``."""
         from fpp_ml_bench.baselines.networks.model import load
 
-        given = cls.checked_options(options)
-        path = (
-            given.weights
-            if given.recipe is None
-            else weights_of_recipe(given.recipe, rig.camera.width)
+        given = cls.checked_options(NetworkOptions, options)
+        return cls(
+            load(_weights(given, rig.camera.width), given.device),
+            given.frame,
+            given.threads,
+            rig.sequence,
         )
-        return cls(load(path, given.device), given.frame, given.threads, rig.sequence)
 
     @classmethod
-    def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
+    def for_dataset(cls, dataset: Photographed, **options: object) -> Method:
         """`for_rig`. Raises `WeightsError` for a network that was trained at another image size."""
-        if recipe := options.pop("recipe", None):
-            options["weights"] = weights_of_recipe(recipe, dataset.size[1])
-        method = cls.for_rig(dataset.rig, **options)
+        given = cls.checked_options(NetworkOptions, options)
+        weights = _weights(given, dataset.size[1])
+        method = cls.for_rig(dataset.rig, **{**options, "recipe": None, "weights": weights})
         if method.model.config.image_size != dataset.size:
             trained_at, here = (
                 f"{height}x{width}"
                 for height, width in (method.model.config.image_size, dataset.size)
             )
             raise WeightsError(
-                f"{options['weights']}: was trained at {trained_at} px (H x W), {dataset.path} has "
+                f"{weights}: was trained at {trained_at} px (H x W), {dataset.path} has "
                 f"images of {here} "
                 "px: the fringe period in px depends on the size, so a network works at one size "
                 "only; use weights "

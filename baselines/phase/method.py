@@ -7,7 +7,6 @@ large, capture the frames that reduce it (more fringes for the phase, the Gray c
 and measure again. No captured frame is wasted.
 """
 
-import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
+from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, Setting
 from fpp_ml_bench.baselines.phase.audit import measure_audited
 from fpp_ml_bench.baselines.phase.depth import FringeMeasurement, Measurement, Reason
 from fpp_ml_bench.baselines.phase.observe import (
@@ -96,7 +95,7 @@ AUDITED = ", its calibration audited"
 """End of the title of a method with ``--audit``."""
 
 
-def audited_words(settings: Mapping[str, Any]) -> str:
+def audited_words(settings: Mapping[str, Setting]) -> str:
     """What a short name says of the audit."""
     return ", audited" if settings.get("audit") else ""
 
@@ -179,20 +178,30 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
     route's own mask. Raises `PredictionError` for an unknown option or an invalid value,
     `CaptureError` for a mask that can't be used."""
 
+    options: Settings
     name = "phase"
     purpose = "one fringe or a few, nothing learned"
     Options = PhaseOptions
 
     @classmethod
-    def for_rig(cls, rig: Rig, **options: Any) -> Method:
+    def for_rig(cls, rig: Rig, **options: object) -> Method:
         """`FewestFrames` where ``error_mm`` is given."""
-        options = fringe_options(cls.name, rig, options)
-        return (
-            cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
-        )
+        options = {"direction": fringe_direction(rig), **options}
+        given = cls.checked_options(PhaseOptions, options)
+        if given.error_mm is None:
+            return cls(rig, **options)
+        if given.direction in rig.fringe_directions:
+            code = rig.code(given.direction)
+            if isinstance(code, PhaseShift) and not code.is_plain:
+                raise PredictionError(
+                    f"{cls.name}: error_mm needs fringes of one period with Gray code in half "
+                    f"periods, and this rig has {code.title}; say how many frames instead"
+                )
+        del options["error_mm"]
+        return FewestFrames(rig, given.error_mm, **options)
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
-        given = self.checked_options(options)
+    def __init__(self, rig: Rig, **options: object) -> None:
+        given = self.checked_options(PhaseOptions, options)
         settings = Settings(
             **{entry.name: getattr(given, entry.name) for entry in fields(Settings)}
         )
@@ -217,7 +226,7 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
         self.caution = model.caution
 
     @classmethod
-    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Setting]]:
         if not rig.fringe_directions:
             return []
         few = [{"frames": 1}, {"frames": 3}] if rig.sequence.steps >= PIXELWISE else [{"frames": 1}]
@@ -240,7 +249,7 @@ class PhaseMethod(RouteMethod[FringeMeasurement]):
         return f"{name}, standoff" if standoff else name
 
     @classmethod
-    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+    def assumption(cls, settings: Mapping[str, Setting]) -> Assumption | None:
         return fringe_assumption(settings) if settings.get("shading") is True else None
 
 
@@ -253,15 +262,17 @@ def pitch_setting(rig: Rig, direction: Direction) -> dict[str, float]:
     return {"pitch_px": pitch, "periods_in_range": round(rig.periods_in_range(direction), 2)}
 
 
-def fringe_assumption(settings: Mapping[str, Any]) -> Assumption:
+def fringe_assumption(settings: Mapping[str, Setting]) -> Assumption:
     """What tells the order of one fringe with a `pitch_setting`: the range alone, if it has one
     period at most."""
-    return KNOWN_RANGE if settings.get("periods_in_range", math.inf) <= 1 else ONE_ALBEDO
+    periods = settings.get("periods_in_range")
+    return KNOWN_RANGE if isinstance(periods, int | float) and periods <= 1 else ONE_ALBEDO
 
 
-def pitch_words(settings: Mapping[str, Any], before: str = " of ") -> str:
+def pitch_words(settings: Mapping[str, Setting], before: str = " of ") -> str:
     """``" of 36 px"`` for settings with a `pitch_setting`, else nothing."""
-    return f"{before}{float(settings['pitch_px']):g} px" if "pitch_px" in settings else ""
+    pitch_px = settings.get("pitch_px")
+    return f"{before}{pitch_px:g} px" if isinstance(pitch_px, int | float) else ""
 
 
 def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
@@ -324,15 +335,15 @@ class CrossedMethod(RouteMethod[Measurement]):
     Options = CrossedOptions
 
     @classmethod
-    def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
+    def scenes_rig(cls, settings: Mapping[str, Setting]) -> str:
         return "crossed"
 
     @classmethod
-    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+    def assumption(cls, settings: Mapping[str, Setting]) -> Assumption | None:
         return RANGE_AND_WALL
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
-        given = self.checked_options(options)
+    def __init__(self, rig: Rig, **options: object) -> None:
+        given = self.checked_options(CrossedOptions, options)
         self.rig, frames, moved = rig, given.frames, None
         if frames == CROSSED_FRAMES:
             self.frames_used, moved = (
@@ -354,11 +365,15 @@ class CrossedMethod(RouteMethod[Measurement]):
         self.title = (
             f"Crossed fringes of {pitches} px, {count}, nothing learned{AUDITED if audited else ''}"
         )
-        self.settings = {"min_confidence": given.min_confidence} | self.use_mask(given.mask)
-        self.settings |= ({} if frames == 1 else {"frames": frames}) | audited
+        self.settings = {
+            "min_confidence": given.min_confidence,
+            **self.use_mask(given.mask),
+            **({} if frames == 1 else {"frames": frames}),
+            **audited,
+        }
 
     @classmethod
-    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Setting]]:
         crossed = len(rig.sequence.crossed_frames)
         if not crossed and rig.fringe_directions != DIRECTIONS:
             return []
@@ -377,24 +392,12 @@ class CrossedMethod(RouteMethod[Measurement]):
         return images if self.settings.get("frames") == CROSSED_FRAMES else [crossed_image(images)]
 
 
-def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
-    """``options`` of a method called ``name`` that computes with the fringes of one direction, by
-    default the only one that tells depth on the rig. Raises `PredictionError` for an option that
-    its code does not allow."""
+def fringe_direction(rig: Rig) -> Direction:
+    """The fringes to compute with where no direction is named: the only one that tells depth on the
+    rig, or the horizontal one."""
     ways = rig.fringe_directions
     telling = ways if len(ways) < 2 else [way for way in ways if tells_depth(rig, way)]
-    if len(telling) == 1:
-        options = {"direction": telling[0], **options}
-    direction = options.get("direction", "horizontal")
-    if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
-        return options  # refused by the method
-    if options.get("error_mm") is not None and not code.is_plain:
-        raise PredictionError(
-            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and "
-            f"this rig has "
-            f"{code.title}; say how many frames instead"
-        )
-    return options
+    return telling[0] if len(telling) == 1 else "horizontal"
 
 
 @dataclass(frozen=True)
@@ -446,9 +449,10 @@ class FewestFrames(Method):
     except ``frames``. Raises `PredictionError` for an error that is no positive number of mm, and
     as `PhaseMethod`."""
 
+    options: Settings
     reports = True
 
-    def __init__(self, rig: Rig, error_mm: float, **options: Any) -> None:
+    def __init__(self, rig: Rig, error_mm: float, **options: object) -> None:
         self.name = PhaseMethod.name
         if (
             isinstance(error_mm, bool)
