@@ -39,7 +39,7 @@ _OTHER_FILES = {
 """JSON files of this package that are no results, by a key that only they have."""
 
 
-def _json_bytes(content: Any) -> bytes:
+def _json_bytes(content: object) -> bytes:
     return (
         json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n"
     )
@@ -58,7 +58,7 @@ def write_result(result: Result, path: Path) -> None:
     write_file(result_json(result), path)
 
 
-def write_json(content: Any, path: Path) -> None:
+def write_json(content: object, path: Path) -> None:
     """Write plain ``content`` as JSON, as `write_file` does."""
     write_file(_json_bytes(content), path)
 
@@ -85,7 +85,7 @@ def read_json(path: Path) -> Any:
     return read_strict_json(path, SubmissionError, "write it again with fpp-eval --json")
 
 
-def parse_result(content: Any, path: Path) -> Result:
+def parse_result(content: object, path: Path) -> Result:
     """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
     file = printable(path)
     keys = content if isinstance(content, dict) else {}
@@ -120,7 +120,7 @@ def parse_result(content: Any, path: Path) -> Result:
     return validate(Result, content, path, "result of fpp-eval")
 
 
-def json_schema(name: str) -> dict[str, Any]:
+def json_schema(name: str) -> dict[str, object]:
     """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``. It lists the
     keys and what each may hold. Whether averages follow from the samples is checked on reading."""
     models: dict[str, type[pydantic.BaseModel]] = {

@@ -347,13 +347,13 @@ def _check_weights(part: str, measured: str | None, submission: Submission) -> N
 
 
 def disagreements(
-    stored: Any,
-    computed: Any,
+    stored: object,
+    computed: object,
     name: str = "",
     rounding: float = 0.0,
     cancelling: float = 1e-9,
     digits: int | None = None,
-) -> Iterator[tuple[str, Any, Any]]:
+) -> Iterator[tuple[str, object, object]]:
     """Name, stored and computed value of everything in two plain contents that is not the same.
     ``rounding``: absolute difference up to which two numbers count as the same; ``cancelling``:
     that of scores which are a small difference of large numbers, so that it depends on the machine;
@@ -374,12 +374,16 @@ def disagreements(
             yield from disagreements(*pair, f"{name}.{index}", rounding, cancelling, digits)
     elif not (
         stored == computed
-        or (isinstance(stored, float) and same(stored, computed, rounding, digits))
+        or (
+            isinstance(stored, float)
+            and isinstance(computed, float | int | None)
+            and same(stored, computed, rounding, digits)
+        )
     ):
         yield name, stored, computed
 
 
-def _check_same(name: str, stored: Any, computed: Any, rounding: float = 0.0) -> None:
+def _check_same(name: str, stored: object, computed: object, rounding: float = 0.0) -> None:
     """Refuse (ValueError) a stored value, mapping or list that is not what the per-sample scores
     give."""
     for where, value, expected in disagreements(stored, computed, name, rounding):

@@ -43,7 +43,7 @@ from fpp_ml_bench.optics.rig import Rig
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.submission.description import Submission
 
-Depth = NDArray[np.floating[Any]]
+Depth = NDArray[np.floating]
 
 
 def declared_units(target_max: float, units: str | None) -> Units:

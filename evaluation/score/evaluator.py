@@ -64,7 +64,7 @@ from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, skipping
 
-Maps = NDArray[Any] | Sequence[NDArray[Any]]
+Maps = NDArray | Sequence[NDArray]
 WORKERS = 4
 
 
@@ -349,7 +349,7 @@ def evaluate_arrays(
     return ArrayScores(**scores_of(scored))
 
 
-def _sequence(name: str, values: Any) -> Any:
+def _sequence(name: str, values: object) -> Any:
     """``values``, if they are a sequence of maps or names."""
     shape = getattr(values, "shape", None)
     if (
@@ -364,7 +364,7 @@ def _sequence(name: str, values: Any) -> Any:
     return values
 
 
-def _array(name: str, values: Any) -> NDArray[Any]:
+def _array(name: str, values: object) -> NDArray:
     """A map as an array; a mask stays where its meaning is clear, with the targets."""
     try:
         array = np.asanyarray(values)
@@ -389,7 +389,7 @@ def _array(name: str, values: Any) -> NDArray[Any]:
     return array
 
 
-def _void(targets: NDArray[Any], flags: NDArray[Any] | None) -> NDArray[np.bool_]:
+def _void(targets: NDArray, flags: NDArray | None) -> NDArray[np.bool_]:
     """Pixels that count in no set: those masked in the targets, and those flagged."""
     void = np.ma.getmaskarray(targets)
     if flags is None:
@@ -416,11 +416,11 @@ def _void(targets: NDArray[Any], flags: NDArray[Any] | None) -> NDArray[np.bool_
 
 
 def score_arrays(
-    prediction: NDArray[Any],
-    target: NDArray[Any],
+    prediction: NDArray,
+    target: NDArray,
     void: NDArray[np.bool_],
     units: str | None = None,
-    sigma: NDArray[Any] | None = None,
+    sigma: NDArray | None = None,
     edge_band_px: int = protocol.EDGE_BAND_PX,
     check_prediction_units: bool = True,
     nodata: float | None = None,

@@ -44,7 +44,7 @@ _SQUARES_LOST = 1e-280
 an image has about a million pixels."""
 NOT_FINITE = "the errors are not finite, or too large to square (above about 1e140)"
 
-Map = NDArray[np.floating[Any]]
+Map = NDArray[np.floating]
 Errors = NDArray[np.float64]
 
 

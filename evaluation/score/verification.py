@@ -9,6 +9,7 @@ bound.
 """
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from fpp_ml_bench.errors import SubmissionError
@@ -20,7 +21,7 @@ from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-Difference = tuple[str, Any, Any]
+Difference = tuple[str, object, object]
 """Name, stored value and the one that was computed again."""
 PROCESSOR_ERROR = 1e-3
 """Relative difference of a score that processors may make."""
@@ -55,7 +56,7 @@ class Verified(NamedTuple):
     processors: bool = False
 
 
-def differences(scored: Result, folder: Any, dataset: DatasetFolder) -> Verified:
+def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> Verified:
     """What of a result does not follow from the predictions in ``folder`` on ``dataset``.
     Everything is scored again. Time and place of scoring and the method's run time are not
     compared. Raises what `evaluate` raises, and SubmissionError for a result of another protocol
@@ -98,7 +99,7 @@ def differences(scored: Result, folder: Any, dataset: DatasetFolder) -> Verified
         )
         # Other predictions explain all the rest.
         first = sorted(differing, key=lambda difference: difference[0] not in _HASHES)
-        deviations += [(f"{sample}: {name}", *pair) for name, *pair in first]
+        deviations += [(f"{sample}: {name}", before, now) for name, before, now in first]
     if (block is None) != (again_block is None):
         said = [
             "there is none" if part is None else "there is one" for part in (block, again_block)
@@ -142,7 +143,7 @@ def _place(name: str) -> str:
     return name.split(": ")[0] if ": " in name else ""
 
 
-def _within(name: str, stored: Any, computed: Any, far_mm: float) -> bool:
+def _within(name: str, stored: object, computed: object, far_mm: float) -> bool:
     of_sample = ": " in name
     words = [word for word in name.split(": ")[-1].split(".") if not word.isdigit()]
     if not (

@@ -33,6 +33,8 @@ from fpp_ml_bench.evaluation.protocol import LARGEST_MM
 from fpp_ml_bench.files import LOCK_FILE, fill, opened, printable, read_bounded, read_yaml
 
 if TYPE_CHECKING:
+    import pyarrow
+
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 SUBMISSION_FILE = "submission.yaml"
@@ -81,7 +83,7 @@ _SPARE_BYTES, _ARCHIVE_BYTES = 1 << 20, 1 << 16
 """What a file of another form than .npy, and an .npz, may have beside a float64 map."""
 
 
-MapAndHash = tuple[NDArray[Any], str]
+MapAndHash = tuple[NDArray, str]
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class Listing:
 
         return read
 
-    def sigma_mm(self, sample: str, size: tuple[int, int]) -> NDArray[Any]:
+    def sigma_mm(self, sample: str, size: tuple[int, int]) -> NDArray:
         """The `SIGMA` file of a sample, real floats (H, W) in mm; PredictionError, without the
         file's name, for any other content."""
         content = read_bounded(self.folder / f"{sample}{SIGMA}", _largest_npy(size))
@@ -281,7 +283,7 @@ def declared_size(path: Path) -> tuple[int, int] | None:
 
 def parse_npy(
     content: bytes | memoryview, size: tuple[int, int], length: int | None = None
-) -> NDArray[Any]:
+) -> NDArray:
     """The array (H, W) in the bytes of a .npy file, a view; ``length``: that of the file where
     ``content`` may be its beginning only. PredictionError as `read_npy`."""
     if content[:4] == b"PK\x03\x04":
@@ -317,7 +319,7 @@ def parse_npy(
     return flat.reshape(size, order="F" if fortran else "C")
 
 
-def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, int]) -> None:
+def _check_array(dtype: np.dtype, shape: tuple[int, ...], size: tuple[int, int]) -> None:
     """Refuse anything but a real float map of ``size``: objects, complex numbers, whole numbers,
     other shapes."""
     if dtype.hasobject:
@@ -340,7 +342,7 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
 
 
-def parse_npz(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
+def parse_npz(content: bytes, size: tuple[int, int]) -> NDArray:
     """The array (H, W) in an .npz archive; PredictionError as `read_npy`. The array may have any
     name. The size that the archive declares is checked before a byte is unpacked, and unpacking
     stops at the limit even where the archive declares a wrong size."""
@@ -401,7 +403,7 @@ PNG_LEVELS = 65535
 _PNG_ADVICE = "write 16-bit grey levels (cv2.imwrite of a uint16 array)"
 
 
-def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None) -> NDArray[Any]:
+def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None) -> NDArray:
     """Depth (H, W) float64 in mm in a 16-bit PNG; PredictionError as `read_npy`. The header is
     checked before the image is decoded, every checksum and the unpacked length
     (`containers.parse_image`), too. A level of 65535 is refused: there a depth that does not fit
@@ -438,7 +440,7 @@ def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None)
     return image.levels.astype(np.float64) * mm_per_level
 
 
-def parse_mat(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
+def parse_mat(content: bytes, size: tuple[int, int]) -> NDArray:
     """The variable ``depth`` (H, W) of a MATLAB file; PredictionError as `read_npy`."""
     try:
         depth = parse_matrix(content, "depth", _largest_npy(size) + _SPARE_BYTES)
@@ -483,8 +485,8 @@ def depth_maps(
     return depth_map
 
 
-def _check_columns(schema: Any) -> None:
-    """Refuse a ``pyarrow.Schema`` of other columns."""
+def _check_columns(schema: "pyarrow.Schema") -> None:
+    """Refuse other columns."""
     if sorted(schema.names) != ["depth", "sample"]:
         names = printable(", ".join(schema.names), 120)
         raise PredictionError(
@@ -505,8 +507,8 @@ def _check_columns(schema: Any) -> None:
         )
 
 
-def _item_type(value: Any) -> Any:
-    """What a tensor or list type holds; None for any other ``pyarrow.DataType``."""
+def _item_type(value: "pyarrow.DataType") -> "pyarrow.DataType | None":
+    """What a tensor or list type holds; None for any other."""
     import pyarrow as pa  # no other form needs it
 
     if isinstance(value, pa.BaseExtensionType):
@@ -537,8 +539,8 @@ def _rows(names: list[str], samples: Sequence[str]) -> dict[str, int]:
     return rows
 
 
-def _depth_map(values: Any, size: tuple[int, int]) -> NDArray[Any]:
-    """The (H, W) map in a ``pyarrow.Array`` of one row."""
+def _depth_map(values: "pyarrow.Array", size: tuple[int, int]) -> NDArray:
+    """The (H, W) map in the values of one row."""
     shape: list[int] = []
     while True:
         values = getattr(values, "storage", values)
