@@ -156,7 +156,7 @@ def certify(
     _check(method, limits or {})
     studio, rig = Studio(settings), settings.rig
     unit_mm, volume = MM_PER_M * settings.object_scale, Volume.of(settings.unit_rig)
-    found: list[Measured] = []
+    results: list[Measured] = []
     repeats: dict[str, list[float]] = {}
     pictures: dict[str, Sequence[Picture]] = {}
     seconds: list[float] = []
@@ -176,13 +176,13 @@ def certify(
     for gauge in gauges(settings.unit_rig):
         seen = before_camera(studio, gauge, used)
         result = answered(seen, 0)
-        found.append(result)
+        results.append(result)
         if gauge.position == 0:
             image = seen.frames(0)[used[0]]
             pictures[gauge.kind] = _pictures(seen.part >= 0, image, result.residual_mm)
             several = [result, *(answered(seen, number) for number in range(1, captures))]
             for symbol in result.values:
-                values = [one.values[symbol] for one in several]
+                values = [each.values[symbol] for each in several]
                 repeats[symbol] = [value for value in values if value is not None]
         progress(1)
     sizes = {"sphere diameter": DIAMETER, "sphere spacing": SPACING, "plane": LENGTH, "step": STEP}
@@ -199,7 +199,7 @@ def certify(
         (*rig.working_range_mm, volume.diagonal_m * unit_mm),
         {name: share * volume.diagonal_m * unit_mm for name, share in sizes.items()},
         captures,
-        _lines(found, repeats, limits or {}),
+        _lines(results, repeats, limits or {}),
         datetime.now(UTC).isoformat(timespec="seconds"),
         describe_hardware(),
         pictures=pictures,
@@ -232,7 +232,7 @@ def certify_board(
     `CaptureError` and `CalibrationError` naming the pose whose frames can't be read or show no
     board."""
     _check(method, limits or {})
-    found: list[Measured] = []
+    results: list[Measured] = []
     pictures: dict[str, Sequence[Picture]] = {}
     seconds: list[float] = []
     x, y = rig.camera.rays()
@@ -271,7 +271,7 @@ def certify_board(
             if off.size:
                 values["L"] = float(off[np.abs(off).argmax()])
         refused = float(1 - (asked & answered).sum() / asked.sum())
-        found.append(Measured(values, int(asked.sum()), refused, residual))
+        results.append(Measured(values, int(asked.sum()), refused, residual))
         if not pictures:
             pictures[folder.name] = _pictures(asked, image, residual)
         progress(1)
@@ -289,7 +289,7 @@ def certify_board(
         (near, far, Volume.of(rig).diagonal_m * MM_PER_M),
         {"board": float(np.ptp(board.points_mm(), axis=0).max()), "spacing": board.spacing_mm},
         1,
-        _lines(found, {}, limits or {}),
+        _lines(results, {}, limits or {}),
         datetime.now(UTC).isoformat(timespec="seconds"),
         describe_hardware(),
         pictures=pictures,
@@ -344,17 +344,19 @@ def _pictures(
 
 
 def _lines(
-    found: Sequence[Measured], repeats: Mapping[str, Sequence[float]], limits: Mapping[str, float]
+    results: Sequence[Measured], repeats: Mapping[str, Sequence[float]], limits: Mapping[str, float]
 ) -> tuple[Line, ...]:
-    symbols = [symbol for symbol in QUANTITIES if any(symbol in one.values for one in found)]
-    return tuple(_line(symbol, found, repeats.get(symbol, ()), limits) for symbol in symbols)
+    symbols = [
+        symbol for symbol in QUANTITIES if any(symbol in result.values for result in results)
+    ]
+    return tuple(_line(symbol, results, repeats.get(symbol, ()), limits) for symbol in symbols)
 
 
 def _line(
-    symbol: str, found: Sequence[Measured], repeats: Sequence[float], limits: Mapping[str, float]
+    symbol: str, results: Sequence[Measured], repeats: Sequence[float], limits: Mapping[str, float]
 ) -> Line:
     quantity = QUANTITIES[symbol]
-    of_symbol = [result for result in found if symbol in result.values]
+    of_symbol = [result for result in results if symbol in result.values]
     values = [v for result in of_symbol if (v := result.values[symbol]) is not None]
     deviation = stdev(repeats) if len(repeats) > 1 else None
     expanded = None if deviation is None else COVERAGE * deviation

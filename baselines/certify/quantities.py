@@ -46,8 +46,8 @@ class Quantity:
 
 
 QUANTITIES: dict[str, Quantity] = {
-    one.symbol: one
-    for one in (
+    quantity.symbol: quantity
+    for quantity in (
         Quantity("PF", "probing, form", "range of the residuals of a fitted sphere"),
         Quantity("PF95", "probing, dispersion", "width of the shell of 95% of a sphere's points"),
         Quantity("PS", "probing, size", "diameter of the fitted sphere less the true one"),
@@ -142,7 +142,7 @@ def corners_mm(
 ) -> NDArray[np.float64]:
     """Points (n, 3) in mm at image points (n, 2) of a plane, float64, by the plane of the points
     (H, W, 3) within a radius; NaN with fewer than half of them."""
-    found = np.full((len(corners_px), 3), np.nan)
+    points = np.full((len(corners_px), 3), np.nan)
     row, column = np.mgrid[: points_mm.shape[0], : points_mm.shape[1]]
     for number, (x, y) in enumerate(corners_px):
         if not np.isfinite([x, y]).all():
@@ -162,8 +162,8 @@ def corners_mm(
         )
         values = np.column_stack([1 / own[known][:, 2], own[known][:, :2] / own[known][:, 2:]])
         inverse, across, down = np.linalg.lstsq(terms, values, rcond=None)[0][0]
-        found[number] = across / inverse, down / inverse, 1 / inverse
-    return found
+        points[number] = across / inverse, down / inverse, 1 / inverse
+    return points
 
 
 def lengths_off_mm(
@@ -207,7 +207,7 @@ def measure(
     points = np.stack([rays[0] * z, rays[1] * z, z], axis=-1)
     of_parts = [points[where & answered] for where in inner]
     residual = np.where(asked & answered, depth_mm - exact_mm, np.nan).astype(np.float32)
-    enough = all(len(one) >= FEWEST_POINTS for one in of_parts)
+    enough = all(len(part) >= FEWEST_POINTS for part in of_parts)
     values: dict[str, float | None] = dict.fromkeys(SYMBOLS[gauge.kind])
     if enough:
         values |= _values(gauge, of_parts, unit_mm)
@@ -222,7 +222,7 @@ def _values(gauge: Gauge, points: Sequence[Points], unit_mm: float) -> dict[str,
     """By symbol; none where the points of a sphere lie on no sphere."""
     surfaces = gauge.surfaces
     if surfaces[0].radius_m is not None:
-        fits = [fit_sphere(one) for one in points]
+        fits = [fit_sphere(part) for part in points]
         true_mm = unit_mm * surfaces[0].radius_m
         if any(fit.values[3] > MOST_RADII * true_mm for fit in fits):
             return {}
@@ -232,7 +232,7 @@ def _values(gauge: Gauge, points: Sequence[Points], unit_mm: float) -> dict[str,
             return {"SD": float(apart - spacing)}
         size = 2 * (fits[0].values[3] - true_mm)
         return {"PF": fits[0].range_mm, "PF95": fits[0].inner_mm, "PS": float(size)}
-    fits = [fit_plane(one) for one in points]
+    fits = [fit_plane(part) for part in points]
     if gauge.kind == "plane":
         return {"F": fits[0].range_mm, "F95": fits[0].inner_mm}
     if gauge.kind == "wedge":
@@ -240,7 +240,7 @@ def _values(gauge: Gauge, points: Sequence[Points], unit_mm: float) -> dict[str,
         between = _angle_deg(*(fit.values[3:] for fit in fits))
         return {"W": _angle_deg(*_normals(surfaces)) - between}
     # The two planes have a common normal: that of their points, each less its mean.
-    common = fit_plane(np.concatenate([one - one.mean(axis=0) for one in points])).values[3:]
+    common = fit_plane(np.concatenate([part - part.mean(axis=0) for part in points])).values[3:]
     height = abs((points[1].mean(axis=0) - points[0].mean(axis=0)) @ common)
     normal = _normals(surfaces)[0]
     true = unit_mm * abs((surfaces[1].point_m - surfaces[0].point_m) @ normal)
@@ -269,7 +269,7 @@ def edge_px(
     beside = (column - start - slope * row) / np.hypot(1, slope)
     inside = (row >= rows.min() + CROP_PX) & (row <= rows.max() - CROP_PX)
     near = inside & (np.abs(beside) <= EDGE_REACH_PX) & (depth_mm > 0)
-    far_mm, near_mm = (float(np.median(one[:, 2])) for one in points_mm)
+    far_mm, near_mm = (float(np.median(plane[:, 2])) for plane in points_mm)
     if not far_mm > near_mm:
         return None
     share = (far_mm - depth_mm[near]) / (far_mm - near_mm)

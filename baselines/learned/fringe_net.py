@@ -78,7 +78,8 @@ class FringeScene:
     def of(cls, grey: Image, period_px: float) -> "FringeScene":
         """Of an image float32 whose longest fringe has ``period_px``."""
         mean, power = (
-            cv2.GaussianBlur(one, (0, 0), WINDOW_PERIODS * period_px) for one in (grey, grey * grey)
+            cv2.GaussianBlur(image, (0, 0), WINDOW_PERIODS * period_px)
+            for image in (grey, grey * grey)
         )
         spread = np.sqrt(np.maximum(power - mean * mean, LEAST_SPREAD_GREY**2))
         return cls(grey, np.asarray(mean, np.float32), np.asarray(spread, np.float32))
@@ -123,11 +124,13 @@ def phases_of(networks: Sequence[FringeNet], x: Image) -> tuple[Phases, Image]:
     count = len(total) // 3
     phase = np.arctan2(total[:count], total[count : 2 * count])
     variance: NDArray = np.mean(
-        [(SCALE_TO_SIGMA * np.exp(one[2 * count : 3 * count])) ** 2 for one in answers], axis=0
+        [(SCALE_TO_SIGMA * np.exp(answer[2 * count : 3 * count])) ** 2 for answer in answers],
+        axis=0,
     )
     if len(answers) > 1:
         apart = [
-            wrapped(np.arctan2(one[:count], one[count : 2 * count]) - phase) for one in answers
+            wrapped(np.arctan2(answer[:count], answer[count : 2 * count]) - phase)
+            for answer in answers
         ]
         variance = variance + np.sum(np.square(apart), axis=0) / (len(answers) - 1)
     logit = (total[-1] / len(answers)).astype(np.float32)

@@ -175,7 +175,8 @@ class FringeNetMethod(RouteMethod[Measurement]):
             raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
         names = [given.weights] if given.weights else list(NETWORKS)
         files = [
-            one if isinstance(one, WeightsFile) else load_net(one) for one in names[: given.members]
+            name if isinstance(name, WeightsFile) else load_net(name)
+            for name in names[: given.members]
         ]
         networks = [file.network for file in files]
         self.weights_config = config = files[0].config

@@ -249,19 +249,23 @@ def _posterior(
     over the scales of the groups."""
     sizes = [sum(CHANGES[part].parameters for part in group) for group in GROUPS]
     chances = np.r_[0.5, np.full(len(SCALES_PX) - 1, 0.5 / (len(SCALES_PX) - 1))]
-    scales = np.array([np.repeat(one, sizes) for one in product(SCALES_PX, repeat=len(GROUPS))])
-    prior = np.array([np.prod(one) for one in product(chances, repeat=len(GROUPS))])
+    scales = np.array(
+        [np.repeat(sizes_px, sizes) for sizes_px in product(SCALES_PX, repeat=len(GROUPS))]
+    )
+    prior = np.array([np.prod(each) for each in product(chances, repeat=len(GROUPS))])
     # A change is known no better than the phases, whose errors have patterns of their own.
     least = np.linalg.inv(
         slopes.T @ slopes / (ALIKE * noise_px**2) + 1e-9 * np.eye(slopes.shape[1])
     )
     known = np.linalg.inv(least + FLOOR_PX**2 * np.eye(len(least)))
-    told = known @ least @ (slopes.T @ values) / (ALIKE * noise_px**2)
-    precision = known + np.eye(len(told)) / scales[:, None, :] ** 2
-    means = np.linalg.solve(precision, np.broadcast_to(told[:, None], (*scales.shape, 1)))[..., 0]
+    observed = known @ least @ (slopes.T @ values) / (ALIKE * noise_px**2)
+    precision = known + np.eye(len(observed)) / scales[:, None, :] ** 2
+    means = np.linalg.solve(precision, np.broadcast_to(observed[:, None], (*scales.shape, 1)))[
+        ..., 0
+    ]
     evidence = (
         np.log(prior)
-        + 0.5 * means @ told
+        + 0.5 * means @ observed
         - 0.5 * np.linalg.slogdet(precision)[1]
         - np.log(scales).sum(axis=1)
     )

@@ -377,20 +377,20 @@ def _judged(
     clipped: NDArray = seen.saturated.astype(np.float32)
     if window is not None:
         clipped = window.moment(clipped) / np.maximum(fit.weight, 1e-3)
-    found, least = depth_mm > 0, settings.min_confidence
+    answered, least = depth_mm > 0, settings.min_confidence
     half_mm = 2 * seen.rig.half_range_mm / HALF_CONFIDENCE_PARTS
-    confidence = np.where(found, 1 / (1 + error_mm / half_mm), 0)
+    confidence = np.where(answered, 1 / (1 + error_mm / half_mm), 0)
     by_reason = {
         Reason.BACKGROUND: ~seen.inside,
         Reason.LOW_MODULATION: fit.brightness < MIN_MODULATION,
         Reason.SATURATED: clipped > SATURATED_SHARE,
-        Reason.OUT_OF_RANGE: ~found,
+        Reason.OUT_OF_RANGE: ~answered,
         **reasons,
         Reason.UNSURE: confidence < least,
     }
     codes = [np.uint8(reason) for reason in by_reason]
     reason = np.select(list(by_reason.values()), codes, np.uint8(Reason.MEASURED))
-    kept = found & ~guessed if least == 0 else found & ~guessed & (confidence >= least)
+    kept = answered & ~guessed if least == 0 else answered & ~guessed & (confidence >= least)
     return Measurement(
         depth_mm=_pasted(seen, np.where(kept, depth_mm, 0)),
         sigma_mm=_pasted(seen, np.where(kept, error_mm, 0)),
@@ -414,10 +414,10 @@ def _restored(
     ``on_object`` from those that were ``known``. Other maps are taken from the ``nearest``
     pixel."""
     in_range = model.resampling.captured.in_range(depth_mm)
-    found = on_object & in_range & (nearest(measured.depth_mm) > 0)
+    answered = on_object & in_range & (nearest(measured.depth_mm) > 0)
     # The nearest depth says nothing of a pixel that has none for a reason of its own.
     own = np.where(known, np.uint8(Reason.BACKGROUND), measured.reason)
-    own = cv2.resize(own, found.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    own = cv2.resize(own, answered.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     reason = np.where(on_object, nearest(measured.reason), own)
     reason[
         on_object & ~in_range & ((reason == Reason.MEASURED) | (reason > Reason.OUT_OF_RANGE))
@@ -427,7 +427,7 @@ def _restored(
         return np.where(where, nearest(values), np.float32(0))
 
     return Measurement(
-        depth_mm=np.where(found, depth_mm, 0).astype(np.float32),
+        depth_mm=np.where(answered, depth_mm, 0).astype(np.float32),
         sigma_mm=taken(measured.sigma_mm, on_object & in_range),
         order_doubt_mm=taken(measured.order_doubt_mm, on_object & in_range),
         confidence=taken(measured.confidence, on_object & in_range),

@@ -435,7 +435,7 @@ def steadied(
     slow = weight * modulation * own / carrier
     maps = (weight, weight * modulation * modulation, slow.real, slow.imag)
     share, power, real, imaginary = (
-        cv2.GaussianBlur(np.ascontiguousarray(one), (0, 0), sigma_px) for one in maps
+        cv2.GaussianBlur(np.ascontiguousarray(image), (0, 0), sigma_px) for image in maps
     )
     share = np.maximum(share, np.float32(1e-6))
     weak = inside & (power < (WEAK_SIGMAS * noise_grey) ** 2 * share)

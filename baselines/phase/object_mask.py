@@ -174,9 +174,9 @@ def gaps(inside: Mask, background: Background, misfit_grey: Image) -> tuple[Mask
     )
     noise = background.noise_grey**2
     plane = inside & ~background.different & (as_plane < GAP_PLANE * noise)
-    found = plane & (as_object > GAP_OBJECT * noise)
-    rim = cv2.dilate((~inside | found).astype(np.uint8), disk(SEAM_PX)) > 0
-    return found, plane & rim & ~found
+    gap = plane & (as_object > GAP_OBJECT * noise)
+    rim = cv2.dilate((~inside | gap).astype(np.uint8), disk(SEAM_PX)) > 0
+    return gap, plane & rim & ~gap
 
 
 def modulated_region(

@@ -58,8 +58,10 @@ class MethodSettings:
             self.name, dataset, trust=self.trust, **self.options, **threads
         )
         config = method.weights_config
-        told = None if isinstance(dataset, Rig) else dataset.manifest
-        warning = None if config is None or told is None else training_data_warning(config, told)
+        manifest = None if isinstance(dataset, Rig) else dataset.manifest
+        warning = (
+            None if config is None or manifest is None else training_data_warning(config, manifest)
+        )
         if warn and config is not None and warning is not None:
             print(f"warning: {config.name} was {warning}", file=sys.stderr)
         return method
