@@ -244,7 +244,7 @@ def filled(path: Path, blocks: Mapping[str, str]) -> str:
     return text
 
 
-SHOWN = 5
+SHOWN = 6
 """Methods of one frame that README shows; the page shows them all."""
 _MADE_BY = "Made by `python benchmarks/upkeep.py readme` from the files in `leaderboard/rows/`."
 _COLUMNS = (

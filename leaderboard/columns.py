@@ -21,7 +21,7 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.ranking import Ranked
 from fpp_ml_bench.leaderboard.row_file import Row, RowUncertainty, processor
 from fpp_ml_bench.leaderboard.rows import TEST, UNSEEN, Entry
-from fpp_ml_bench.style import millimetres, percent
+from fpp_ml_bench.style import millimetres, percent, three_digits
 
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
@@ -160,7 +160,7 @@ def time_text(row: Ranked, per_second: float = 1.0) -> str:
     """The time of an image in seconds, or in another unit, to three significant digits."""
     value = row.entry.value("seconds_per_sample")
     mark = "" if row.entry.time_measured else NOT_CHECKED
-    return "-" if value is None else f"{per_second * value:.3g}{mark}"
+    return "-" if value is None else f"{three_digits(per_second * value)}{mark}"
 
 
 def reliance(entry: Entry) -> str:
