@@ -64,8 +64,8 @@ class FringeNetOptions:
     anyway: bool = option(False, ANYWAY)
     even_odds: bool = option(
         False,
-        "leave out pixels that are as likely wall as object: a third of the invented pixels, "
-        "more missed ones (default: miss few)",
+        "leave out pixels that are as likely wall as object: invents a third to half as many, "
+        "misses more (default: miss few)",
     )
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     threads: int = 1

@@ -15,6 +15,7 @@ from fpp_ml_bench import machine as hardware
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
+from fpp_ml_bench.evaluation.result.model import disagreements
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.sample import column_hash
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -301,3 +302,9 @@ def test_gpus_are_named_by_nvidia_smi(monkeypatch):
     monkeypatch.setattr(hardware.shutil, "which", lambda name: "/usr/bin/nvidia-smi")
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: Answer)
     assert hardware.describe_hardware().gpu == "2 x NVIDIA H100, NVIDIA T4"
+
+
+def test_a_number_and_a_text_are_a_difference():
+    stored, computed = {"a": [1.0, 2.0]}, {"a": [1.0, "2.0"]}
+    assert list(disagreements(stored, computed)) == [("a.1", 2.0, "2.0")]
+    assert list(disagreements({"a": 2.0}, {"a": 2})) == []
