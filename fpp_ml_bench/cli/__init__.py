@@ -35,7 +35,6 @@ EXTRAS = {
     "train": ("torch", "torchmetrics", "accelerate", "safetensors"),
     "diagnose": ("captum", "mpmath"),
     "published": ("h5py",),
-    "onnx": ("onnx", "onnxruntime", "onnxscript"),
     "cluster": ("ray",),
 }
 """The optional parts of the package (pyproject.toml) and the libraries that only they need."""
