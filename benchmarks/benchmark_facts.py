@@ -23,7 +23,8 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.evaluation.protocol import MODES, TARGETS
 from fpp_ml_bench.loaders.render.track import track
 from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, FACTS, TRACK, intended_benchmark
-from fpp_ml_bench.loaders.storage.store import DatasetFolder, datasets_below
+from fpp_ml_bench.loaders.storage.manifest import datasets_below
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.loaders.storage.verification import verify
 
 

@@ -97,7 +97,7 @@ def score_folder(
     from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
     from fpp_ml_bench.evaluation.score.evaluator import explain_eval
     from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
-    from fpp_ml_bench.loaders.storage.store import datasets_below
+    from fpp_ml_bench.loaders.storage.manifest import datasets_below
 
     prepare_process()
     _check_outputs(json, page, predictions)

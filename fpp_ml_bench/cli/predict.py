@@ -24,7 +24,8 @@ from fpp_ml_bench.evaluation.result.parts import Timing
 from fpp_ml_bench.evaluation.submission.description import read_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import REFUSED_FILE, SUBMISSION_FILE
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders.storage.store import DatasetFolder, datasets_below
+from fpp_ml_bench.loaders.storage.manifest import datasets_below
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
 

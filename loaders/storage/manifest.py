@@ -22,6 +22,7 @@ from fpp_ml_bench.constants import (
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import (
     file_hash,
+    is_file,
     path_problem,
     printable,
     read_json,
@@ -190,6 +191,11 @@ def read_manifest(folder: Path) -> Manifest:
             raise DatasetError(
                 f"{folder}: this build is not finished; run the same command again and it resumes"
             )
+        if datasets := datasets_below(folder):
+            raise DatasetError(
+                f"{folder}: holds {len(datasets)} datasets and is none itself; name one of them, "
+                f"such as {next(iter(datasets.values()))}"
+            )
         raise DatasetError(f"{folder}: no {MANIFEST} there, so this is no dataset of fpp-ml-bench")
     content = read_json(path, DatasetError, "it is damaged: build or import the dataset again")
     try:
@@ -219,6 +225,14 @@ def read_manifest(folder: Path) -> Manifest:
                 f"{folder / name}: is a link out of the dataset; put the file itself there"
             )
     return manifest
+
+
+def datasets_below(folder: Path) -> dict[str, Path]:
+    """The dataset folders directly below ``folder`` by name; none of a folder that is a dataset, or
+    is none."""
+    if is_file(folder / MANIFEST) or not folder.is_dir():
+        return {}
+    return {path.name: path for path in sorted(folder.iterdir()) if is_file(path / MANIFEST)}
 
 
 def strictly(kind: type[Kind], value: Any, where: str = "") -> Kind:

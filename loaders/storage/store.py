@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import CONFIGS, SPLITS, TRAIN
 from fpp_ml_bench.depth import RangeRule, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.files import cause_of, is_file, opened, printable
+from fpp_ml_bench.files import cause_of, opened, printable
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
@@ -493,14 +493,6 @@ class _Skeleton(io.RawIOBase):
             if start >= 0 and start + buffer.size <= len(content):
                 return position + start, buffer.size
         raise ValueError("a buffer that is compressed, or leads elsewhere")
-
-
-def datasets_below(folder: Path) -> dict[str, Path]:
-    """The dataset folders directly below ``folder`` by name; none of a folder that is a dataset, or
-    is none."""
-    if is_file(folder / MANIFEST) or not folder.is_dir():
-        return {}
-    return {path.name: path for path in sorted(folder.iterdir()) if is_file(path / MANIFEST)}
 
 
 def load_dataset(

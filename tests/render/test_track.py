@@ -11,7 +11,7 @@ import pytest
 from conftest import fpp_bench, fpp_eval, printed, read_json, refusal
 
 from fpp_ml_bench.design.rigs import broken_rule
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.result.parts import TrackScores
 from fpp_ml_bench.evaluation.score.track import score_track
 from fpp_ml_bench.evaluation.submission.prediction_files import REFUSED_FILE
@@ -20,7 +20,8 @@ from fpp_ml_bench.leaderboard.row_file import RowTrack, in_brief
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.track import TRACK_LIGHTS, TRACK_VIEWS, track
 from fpp_ml_bench.loaders.storage.benchmark import TRACK, benchmark_sentence
-from fpp_ml_bench.loaders.storage.store import DatasetFolder, datasets_below
+from fpp_ml_bench.loaders.storage.manifest import datasets_below
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 SUBMISSION = """\
 name: mine
@@ -33,7 +34,7 @@ seconds_per_sample: null
 NEAR = """\
 import numpy as np
 from fpp_ml_bench import Method
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import DatasetError, PredictionError
 
 class Near(Method):
     name, title, frames_used = "near", "Near rigs alone", (0,)
@@ -103,6 +104,11 @@ def _predict(small, below, error_mm: float) -> None:
             depth_mm[depth_mm > 0] += error_mm
             np.save(folder / f"{sample}.npy", depth_mm)
         (folder / "submission.yaml").write_text(SUBMISSION)
+
+
+def test_a_track_is_no_dataset_and_its_datasets_are_named(small):
+    with pytest.raises(DatasetError, match=r"holds 2 datasets and is none itself.*rig-02-paper"):
+        DatasetFolder(small)
 
 
 def test_a_track_is_scored_in_units_that_compare_between_rigs(small, tmp_path):
