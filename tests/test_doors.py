@@ -78,6 +78,7 @@ def called():
     return list(calls())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("door", DOORS)
 def test_nobody_goes_around_a_door(door, called):
     form, whole = re.compile(door, re.DOTALL), r"\(" in door

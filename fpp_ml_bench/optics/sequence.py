@@ -115,11 +115,19 @@ class AnySequence(ABC):
 
     def indices(self, **wanted: object) -> tuple[int, ...]:
         """Indices of the frames whose attributes are as wanted, in the order of the sequence."""
-        return tuple(
-            frame.index
-            for frame in self.frames
-            if all(getattr(frame, name) == value for name, value in wanted.items())
-        )
+        key = tuple(wanted.items())
+        if key not in self._indices:  # a decoding asks thousands of times
+            self._indices[key] = tuple(
+                frame.index
+                for frame in self.frames
+                if all(getattr(frame, name) == value for name, value in key)
+            )
+        return self._indices[key]
+
+    @cached_property
+    def _indices(self) -> dict[tuple[tuple[str, object], ...], tuple[int, ...]]:
+        """The answers of `indices` by what was wanted."""
+        return {}
 
     def coded(self, direction: Direction) -> tuple[int, ...]:
         """Frame indices of a direction's code, in the code's own order: sinusoids, then Gray

@@ -101,10 +101,13 @@ class Manifest:
     def fingerprint(self) -> str:
         """SHA-256 over what defines the data: schema, rig, rows and the hash of every shard; 64 hex
         digits."""
-        content = asdict(self)
-        for key in ("others", "generator"):
-            content.pop(key)
-        return sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+        defining = {
+            entry.name: getattr(self, entry.name)
+            for entry in fields(self)
+            if entry.name not in ("others", "generator")
+        }
+        text = json.dumps(defining, sort_keys=True, allow_nan=False, default=asdict)
+        return sha256(text.encode()).hexdigest()
 
     @cached_property
     def sequence(self) -> AnySequence:

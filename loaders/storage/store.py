@@ -466,7 +466,8 @@ class _Skeleton(io.RawIOBase):
 
     def __init__(self, file: int) -> None:
         self._file, self._size, self._position = file, os.fstat(file).st_size, 0
-        self._given: list[tuple[NDArray[np.uint8], int]] = []
+        self._given: list[tuple[NDArray[np.uint8], int, int]] = []
+        """What pyarrow was given, its address in memory, and its place in the file."""
 
     def readable(self) -> bool:
         return True
@@ -479,7 +480,8 @@ class _Skeleton(io.RawIOBase):
             content = mmap.mmap(
                 -1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ
             )
-        self._given.append((np.frombuffer(content, np.uint8), self._position))
+        given = np.frombuffer(content, np.uint8)
+        self._given.append((given, given.ctypes.data, self._position))
         self._position += len(content)
         return content
 
@@ -488,8 +490,8 @@ class _Skeleton(io.RawIOBase):
         file lacks."""
         if buffer is None or not buffer.size:
             return 0, 0
-        for content, position in self._given:
-            start = buffer.address - content.ctypes.data
+        for content, address, position in self._given:
+            start = buffer.address - address
             if start >= 0 and start + buffer.size <= len(content):
                 return position + start, buffer.size
         raise ValueError("a buffer that is compressed, or leads elsewhere")

@@ -59,6 +59,7 @@ def interior_rmse_mm(opened, direction, steps):
     return np.sqrt(squares / count)
 
 
+@pytest.mark.long
 def test_error_follows_one_over_root_n(noisy):
     errors = np.array([interior_rmse_mm(noisy, "both", steps) for steps in STEPS])
     scaled = errors * np.sqrt(STEPS)
@@ -66,6 +67,7 @@ def test_error_follows_one_over_root_n(noisy):
     assert (np.diff(errors) < 0).all()
 
 
+@pytest.mark.long
 def test_both_directions_are_better_than_either(noisy):
     errors = {d: interior_rmse_mm(noisy, d, 18) for d in ("vertical", "horizontal", "both")}
     assert errors["vertical"] < errors["horizontal"]  # baselines of 125 and 100 mm
@@ -73,6 +75,7 @@ def test_both_directions_are_better_than_either(noisy):
     assert errors["both"] == pytest.approx(combined, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("direction", "steps"), [("both", 18), ("vertical", 6), ("horizontal", 4)])
 def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps, monkeypatch):
     """Where noise is all there is, before what light and calibration may add; of grazing pixels of
@@ -99,6 +102,7 @@ def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps, mon
         assert (found < sigmas).mean() == pytest.approx(nominal, abs=0.02)
 
 
+@pytest.mark.long
 def test_the_calibration_s_error_is_stated_and_moves_no_depth(noisy):
     known = replace(noisy.rig, calibration_px=0.25)
     assert known == noisy.rig and rig_from_dict(known.to_dict()).calibration_px == 0.25
@@ -136,12 +140,14 @@ def test_noise_that_light_brings_is_told_from_noise_in_the_dark():
     assert noise_by_light([None] * len(frames), rig) is None
 
 
+@pytest.mark.long
 def test_steps_that_do_not_divide_eighteen(noisy):
     assert interior_rmse_mm(noisy, "both", 7) < 1.5 * interior_rmse_mm(noisy, "both", 18) * np.sqrt(
         18 / 7
     )
 
 
+@pytest.mark.long
 def test_accuracy_in_the_papers_light(opened):
     """With further bounces and pixels with an area: 0.31 to 1.15 mm, of which single bounced and
     mixed pixels bring the more; 0.26 to 0.62 mm without them."""

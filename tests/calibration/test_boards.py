@@ -189,6 +189,7 @@ def test_dots_that_are_brighter_than_the_board_are_seen():
         parse_board("circles:7x5:10:2.5").find(255 - image[:, 100:])
 
 
+@pytest.mark.long
 def test_labels_are_never_mirrored():
     board = parse_board("checker:7x5:10")
     for image in (_drawn(board), np.ascontiguousarray(_drawn(board)[:, ::-1])):

@@ -159,6 +159,7 @@ def projector_jacobian(points, index, step_mm=0.01):
     return to_projector @ np.linalg.inv(to_image)
 
 
+@pytest.mark.long
 def test_an_irregular_board_is_estimated_whatever_its_labels():
     board = parse_board("checker:6x5:28")
     irregular = board.points_mm() + np.random.default_rng(3).normal(0, 0.08, (30, 3))
@@ -215,6 +216,7 @@ def test_missing_points_are_left_out():
     np.testing.assert_allclose(_values(calibration)[0], _truth(), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.long
 def test_the_rational_lens_has_eight_terms():
     poses, lens = rigs.poses(BOARD.points_mm(), noise_px=0.02), Lens("rational")
     calibration = calibrate(poses, BOARD, *SIZES, (lens, lens), hold_out=False)

@@ -54,6 +54,7 @@ def test_a_right_calibration_is_not_doubted(count, noise_px):
     assert doubts(rigs.poses(BOARD.points_mm(), count, noise_px)) == ()
 
 
+@pytest.mark.long
 def test_an_irregular_board_and_panels_of_oblong_pixels_are_not_doubted():
     irregular = BOARD.points_mm() + np.random.default_rng(3).normal(0, 0.08, (20, 3))
     assert doubts(clean(irregular)) == () == doubts(clean(irregular), estimate_board=True)

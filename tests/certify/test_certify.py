@@ -163,6 +163,7 @@ def boards(tmp_path_factory):
     return folder, board
 
 
+@pytest.mark.long
 def test_a_real_board_is_a_gauge(boards, tmp_path):
     folder, board = boards
     words = ["certify", "classical", "--out", tmp_path, "--captures", folder]
@@ -187,6 +188,7 @@ class Far(Method):
         return np.full((RIG.camera.height, RIG.camera.width), 2000.0, np.float32)
 
 
+@pytest.mark.long
 def test_a_certificate_judges_by_its_limits_and_says_what_it_is(few, tmp_path):
     settings = scenes_of(RIG, "paper")
     limits = {"PS": 5.0, "PF": 1e-6, "SD": 5.0}
@@ -215,6 +217,7 @@ def test_a_method_that_does_not_look_is_found_out(few):
     assert abs(lines["W"].largest) > 20 and lines["F"].largest == pytest.approx(0, abs=1e-3)
 
 
+@pytest.mark.long
 def test_what_cannot_be_tested_is_named(few, tmp_path):
     far = Far(RIG)
     far.units = "normalised"

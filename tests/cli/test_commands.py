@@ -294,6 +294,7 @@ def test_show_with_a_damaged_mesh_names_it(copied, tmp_path):
     assert "cork.ply" in refusal(fpp_bench, f"show {copied} cork_A0 --out {tmp_path}/x.png")
 
 
+@pytest.mark.long
 def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert fpp_bench("show", tiny, "cork_A0") == 0

@@ -240,6 +240,7 @@ def test_help_of_a_command_by_a_word():
     assert "COMMAND ..." in printed(fpp_bench, "help")
 
 
+@pytest.mark.long
 def test_measurements_go_only_to_the_code_that_was_scored(mine, tiny):
     Path("other.py").write_text(MINE.replace("1500", "1501"))
     assert fpp_bench("predict mine.py:Mine", tiny, "--out out") == 0
@@ -325,6 +326,7 @@ def test_click_is_told_to_take_no_defaults_from_the_environment(monkeypatch):
     assert np.isfinite(shoot.values(context)["lens"].focal)
 
 
+@pytest.mark.long
 def test_predictions_of_another_dataset_are_refused(predicted):
     line = "build --out other --objects mug,cork --size 176 --pitch 24 --workers 1"
     assert fpp_bench(line, "--config single_shot") == 0

@@ -105,6 +105,7 @@ def groups():
     return rank_files(read_entries(shipped_rows()))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_shipped_rows_keep_their_names_and_their_errors(groups, width):
     for group in groups:

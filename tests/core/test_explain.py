@@ -43,6 +43,7 @@ def test_the_account_adds_up_and_drops_lines_with_nothing_left_out():
         assert not explained("build", "nothing", [rays]).skipping
 
 
+@pytest.mark.long
 def test_build_and_its_account(tmp_path):
     line = f"build --size {TINY_SIZE} --objects cork --config single_shot --workers 1"
     said = printed(fpp_bench, line, f"--out {tmp_path}/on --explain-json {tmp_path}/account.json")
@@ -106,6 +107,7 @@ def test_a_dataset_of_an_earlier_version_is_refused_in_words(opened):
         )
 
 
+@pytest.mark.long
 def test_predictions_scores_and_their_accounts(tiny, tmp_path):
     account = tmp_path / "account.json"
     explain = f"--explain-json {account}"

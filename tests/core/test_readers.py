@@ -188,6 +188,7 @@ def test_json_is_read_as_it_is():
     assert strict_json(f'["{text}"]') == [text]
 
 
+@pytest.mark.long
 def test_a_result_of_too_many_objects_is_refused_before_anything_is_computed(valid, monkeypatch):
     """8,000 objects in 11 MB took 2 GB: the intervals are resampled over objects."""
     monkeypatch.setattr(

@@ -31,6 +31,7 @@ def test_a_rig_gets_the_proposed_pair(tmp_path):
     assert "its crossed" in printed(fpp_bench, "patterns --design", written)
 
 
+@pytest.mark.long
 def test_a_rig_of_one_direction_keeps_its_code(tmp_path):
     wave = {"scheme": "phase-shift", "pitches_px": [114, 912], "steps": 3}
     rig = rig_with({"vertical": wave}, 480, translation_m=[0.16, 0.0, 0.0], background_m=None)

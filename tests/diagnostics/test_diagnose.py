@@ -261,6 +261,7 @@ class Counted:
         return Finding("Once.", {"runs": self.runs})
 
 
+@pytest.mark.long
 def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_path, monkeypatch):
     counted = Counted()
     monkeypatch.setattr(probe, "make_probe", lambda name: counted)

@@ -200,6 +200,7 @@ def test_standard_is_mean_and_spread_of_each_channel():
     assert factor[2] == 0  # a constant channel says nothing
 
 
+@pytest.mark.long
 def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     torch.manual_seed(0)
 
@@ -290,6 +291,7 @@ def test_the_layer_of_an_identity_is_the_raw_input(opened):
     assert 0.2 < r2[INPUT, "phase"] < 0.5
 
 
+@pytest.mark.long
 def test_spatial_probes_of_an_edge_reader_read_edges(opened):
     subject = oracle(opened, ("edges",))
     errors = spatial_errors(subject, opened, 25)
@@ -303,6 +305,7 @@ def test_spatial_probes_of_an_edge_reader_read_edges(opened):
     assert trained < 0.25 and trained < raw
 
 
+@pytest.mark.long
 def test_a_layer_that_holds_the_mask_alone_is_the_silhouette_control(opened):
     subject = oracle(opened, ("object",))
     r2 = linear_r2(subject, opened)

@@ -149,6 +149,7 @@ def exact(opened):
     return load_method("classical", opened.rig)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("units", ["mm", "normalised"])
 def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
     def answer(frames):

@@ -86,6 +86,7 @@ def test_a_frame_delivered_twice_is_named(steps, copied):
     assert name == "equal frames" and f"step {steps - 2} and {steps - 1}: vertical sinusoid" in text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("steps", [3, 4, 8])
 def test_lamps_that_flicker_by_two_percent_are_no_fault(steps):
     rig = vertical(FOUR | {"steps": steps})
@@ -94,6 +95,7 @@ def test_lamps_that_flicker_by_two_percent_are_no_fault(steps):
     assert said(np.rint(frames * gain[:, None, None]).astype(np.uint8), rig) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("steps", [3, 4, 18])
 def test_a_late_frame_is_a_wrong_step_and_no_response(steps):
     rig = vertical(FOUR | {"steps": steps})
@@ -196,6 +198,7 @@ def test_two_directions_tell_more():
         assert text in said(np.ascontiguousarray(frames[order]), rig)[0][1]
 
 
+@pytest.mark.long
 def test_directions_of_different_codes_have_readings_of_their_own():
     """One without Gray code, and two with 5 and 8 bits: each is rearranged by its own code."""
     two = {"order": ["horizontal", "vertical"], "vertical": FOUR}
@@ -209,6 +212,7 @@ def test_directions_of_different_codes_have_readings_of_their_own():
     assert "another reading" in text and "Gray code with the least significant bit first" in text
 
 
+@pytest.mark.long
 def test_the_scene_of_two_captures_is_named():
     rig = rig_with(TWO)
     texture = 0.2 + 0.6 * (np.indices((SIZE, SIZE)).sum(axis=0) // 25 % 2)
@@ -219,6 +223,7 @@ def test_the_scene_of_two_captures_is_named():
     assert "scene moved" in [name for name, _ in said(np.concatenate([one[:8], other[8:]]), rig)]
 
 
+@pytest.mark.long
 def test_depths_out_of_the_range_name_the_range_or_the_unit():
     rig = vertical(FOUR)
     frames = frames_of(rig)

@@ -137,6 +137,7 @@ def test_slope_is_the_difference_of_projections():
         np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 0.2, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_saturated_frames_are_named(capture, decode, tmp_path, capsys):
     bright = np.clip(np.multiply(capture[1], 2.5), 0, 255).astype(np.uint8)
     assert decode(write(tmp_path / "bright", bright)) == 0

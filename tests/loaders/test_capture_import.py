@@ -222,6 +222,7 @@ def test_shards_hold_few_large_images():
     assert len(plan_rows("test", samples, 1 << 28)) == 60
 
 
+@pytest.mark.long
 def test_frames_in_another_order_are_refused_and_imported_anyway(scanned):
     """The frames in the opposite order: some pixels get a depth all the same."""
     files = sorted((scanned / "scans" / "bolt").iterdir())
@@ -350,6 +351,7 @@ def test_options_belong_to_one_kind_of_import(scanned):
     assert "--bits belongs to captures" in refusal(fpp_bench, line, "--bits 12")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "said"),
     [

@@ -195,6 +195,7 @@ def _halves(pixels: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.broadcast_to(upper, pixels.shape[:2]), np.broadcast_to(~upper, pixels.shape[:2])
 
 
+@pytest.mark.long
 def test_the_near_side_follows_the_pointer(browser, tmp_path):
     """A near point, bright, before a dark plane moves to the right with a drag to the right, and
     down with one down."""
@@ -248,6 +249,7 @@ def test_without_webgl_the_page_says_so(browser, tmp_path):
     assert browser.complaints() == []
 
 
+@pytest.mark.long
 def test_axe_finds_nothing(browser, tmp_path):
     if os.environ.get("CI", "").lower() in ("1", "true"):
         import axe_core_python

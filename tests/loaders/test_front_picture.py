@@ -65,6 +65,7 @@ def test_missing_pixels_have_a_colour_and_a_legend():
     assert plain.axes[0].get_legend() is None
 
 
+@pytest.mark.long
 def test_an_answer_off_the_object_alone_and_none():
     other = np.where(EXACT_MM > 0, 0, 1700).astype(np.float32)
     assert front_picture(FRAME, other, EXACT_MM, RIG, "off").startswith(b"\x89PNG")

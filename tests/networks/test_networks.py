@@ -42,6 +42,7 @@ def parameter_count(module):
     return sum(parameter.numel() for parameter in module.parameters())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NETWORKS)
 def test_paper_parameter_counts(name):
     with torch.device("meta"):
@@ -53,6 +54,7 @@ def test_discriminator_parameter_count():
         assert parameter_count(discriminator()) == 5_527_426
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NETWORKS)
 def test_full_width_runs_at_960_px_on_the_meta_device(name):
     with torch.device("meta"):

@@ -32,6 +32,7 @@ def test_gradients_of_a_constant_image_are_finite(name, value, bfloat16):
         assert parameter.grad is not None and parameter.grad.isfinite().all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NETWORKS)
 def test_every_parameter_learns(name):
     network = build(name, **SMALL[name])
@@ -61,6 +62,7 @@ def test_training_in_channels_last_has_the_gradients_of_float64(name):
     assert (gradient(torch.float32) - exact).norm() < 1e-2 * exact.norm()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("affine", "layout"), [(False, torch.channels_last), (True, torch.contiguous_format)]
 )

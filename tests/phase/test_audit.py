@@ -53,6 +53,7 @@ def test_a_right_calibration_loses_nothing() -> None:
     assert audit.across_px[0] < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "roll_deg", "zoom_percent"),
     [(rolled(ROLL_DEG), ROLL_DEG, 0.0), (zoomed(ZOOM_PERCENT), 0.0, ZOOM_PERCENT)],
@@ -110,6 +111,7 @@ def test_an_image_without_points_says_nothing() -> None:
     assert audit.report()["audit"]["says"] == "too few points to audit the calibration"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["crossed", "fringe-net"])
 def test_a_method_reports_its_audit(name: str) -> None:
     method = load_method(name, RIG, audit=True)

@@ -159,6 +159,7 @@ BESIDE = {f"calibration {px} px": moved_rig(px) for px in (-1.0, 0.5, 1.0)}
 BESIDE |= {f"wall at {depth_m} m": replace(CUT, background_m=depth_m) for depth_m in (3.14, 3.26)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("true", BESIDE.values(), ids=BESIDE)
 def test_the_wall_is_found_beside_its_place(true: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     image = frame(DEPTH_MM, true, FAMILY)
@@ -216,6 +217,7 @@ def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(
     assert invented() > 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frames", [1, 3])
 def test_what_is_in_the_images_border_alone_is_no_object(
     frames: int, monkeypatch: pytest.MonkeyPatch

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import cv2
@@ -52,7 +51,7 @@ def route(direction: str, rig: Rig = RIG, **options: object) -> FringeRoute:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize(
     ("rig", "distance_m"),
-    [*product((RIG, OTHER_RIG), (1.52, 1.8, 2.08)), (TURNED_RIG, 1.8)],
+    [(RIG, 1.52), (OTHER_RIG, 2.08), (TURNED_RIG, 1.8)],
 )
 def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: str) -> None:
     tilt = (0.1, -0.06)
@@ -209,6 +208,7 @@ def test_nothing_is_measured_where_nothing_is() -> None:
     assert not route("horizontal").measure(dark).depth_mm.any()
 
 
+@pytest.mark.long
 def test_saturated_ambiguous_and_thin_are_said() -> None:
     exact_m = plane_depth_m(RIG, 1.8)
     image = plane_fringe(RIG, 0, exact_m)

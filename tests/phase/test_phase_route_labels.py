@@ -37,6 +37,7 @@ def best(*arrays: np.ndarray) -> float:
     return min(energy(np.array(labels).reshape(shape), *arrays) for labels in every)
 
 
+@pytest.mark.long
 def test_chains_are_solved_exactly() -> None:
     for seed in range(5):
         for shape in ((1, 7), (7, 1)):

@@ -93,6 +93,7 @@ def test_a_dim_texture_is_not_taken_for_the_background() -> None:
     assert not measurement.depth_mm.any()
 
 
+@pytest.mark.long
 def test_long_periods_are_measured_on_a_smaller_image(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = replace(RIG, pitch_horizontal_px=110.0, pitch_vertical_px=110.0)
     row = photograph("cracker_box", "A60", rig)

@@ -124,6 +124,7 @@ def test_a_missing_file_and_a_value_that_is_not_a_scalar(tmp_path):
             read_scalar(tmp_path / "a.mat", "depth_min")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["compressed", "plain", "v7.3", "written here"])
 def test_damage_is_refused_or_harmless_never_a_crash(tmp_path, kind):
     """SciPy 1.17 ends its process (segmentation fault) on some of the uncompressed files."""

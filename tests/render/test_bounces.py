@@ -132,6 +132,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["shell", "torus", "box", "two boxes"])
 def test_rows_and_reciprocity(name):
     surfels = hollow_sphere()[0] if name == "shell" else Surfels.of(SHAPES[name])
@@ -212,6 +213,7 @@ def test_interpolation_reproduces_a_constant_and_a_ramp():
     assert (far == 0).all()
 
 
+@pytest.mark.long
 def test_light_from_the_background_plane_against_an_integral():
     """Irradiance of a ball's back from the lit part of the plane, by the midpoint rule with the
     inverse square and the cosines written out."""

@@ -139,6 +139,7 @@ def test_every_view_covers_3_to_40_percent(name):
     assert min(cover) >= 0.03 and max(cover) <= 0.40
 
 
+@pytest.mark.long
 def test_covers_and_depth_ranges_are_the_papers():
     cover = np.array([len(depth) / SIZE**2 for name in OBJECTS for depth in views_of(name)])
     spread = {name: [np.ptp(depth) for depth in views_of(name)] for name in OBJECTS}
@@ -148,6 +149,7 @@ def test_covers_and_depth_ranges_are_the_papers():
     assert deepest == "wooden_boards" and 445 <= max(spread[deepest]) <= 475
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ALL)
 def test_no_view_is_flat_and_six_views_of_an_object_differ(name):
     """A view of one single depth would have no range to normalise by; nothing is so round that two

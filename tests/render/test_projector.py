@@ -82,6 +82,7 @@ def test_every_pattern_level_shines_by_the_response(response):
         np.testing.assert_allclose(read(light, index, w, 1.8), expected, atol=1e-7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frame", [0, 4])  # horizontal, vertical
 @pytest.mark.parametrize(
     "light",

@@ -107,6 +107,7 @@ def test_names_are_told_apart_where_they_are_joined():
     assert len(keys) == 312
 
 
+@pytest.mark.long
 def test_hash_is_a_bijection_of_the_pixel_number():
     sample = np.concatenate([PIXELS, np.arange(2**32 - 500_000, 2**32, dtype=np.uint32)])
     hashes = hash_pixels(sample, stream_keys(2**40, "anything"))
@@ -349,6 +350,7 @@ def test_kernel_and_numpy_give_the_same_bytes(name):
         )
 
 
+@pytest.mark.long
 def test_light_and_sensor_one_after_the_other_give_the_same_bytes():
     """`radiance` and then `sense`, as with a blurring lens between, is `expose`."""
     exposure = exposure_under("hard")

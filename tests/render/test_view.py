@@ -219,6 +219,7 @@ def test_ambient_occlusion_is_the_open_share_of_the_groove():
     assert dark[inside].min() < 120 and dark[inside].max() > 170
 
 
+@pytest.mark.long
 def test_an_object_is_cut_into_surfels_once_for_all_its_views_and_lights(monkeypatch):
     ball, cut = replace(BALL), Mock(wraps=lighting.Surfels.of)
     monkeypatch.setattr(lighting.Surfels, "of", cut)

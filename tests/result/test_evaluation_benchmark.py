@@ -215,6 +215,7 @@ def test_a_dataset_that_was_changed_is_not_scored(named, tmp_path):
     assert read_result(tmp_path / "r.json").dataset.benchmark is None
 
 
+@pytest.mark.long
 def test_a_build_that_lacks_columns_is_still_the_benchmark(tmp_path, monkeypatch):
     settings = tiny_settings(objects=("power_drill",))
     whole, part = tmp_path / "all", tmp_path / "part"

@@ -127,6 +127,7 @@ def test_it_belongs_to_the_very_method_that_was_scored(file):
         check_same_method(file, about, Method(), timed=True)
 
 
+@pytest.mark.long
 def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 

@@ -64,6 +64,7 @@ def test_every_score_agrees_with_float128(case):
         assert scores[key] == pytest.approx(float(value), rel=relative, abs=rounding), key
 
 
+@pytest.mark.long
 @given(st.lists(cases(), min_size=1, max_size=4))
 @settings(max_examples=150, deadline=None)
 def test_scores_of_any_errors_contradict_nothing(views):

@@ -259,6 +259,7 @@ def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
     assert fpp_eval(*command) == 2
 
 
+@pytest.mark.long
 def test_schema_describes_the_file(make):
     import jsonschema
 

@@ -71,6 +71,7 @@ def scored(tmp_path_factory):
     return folder, dataset, predictions
 
 
+@pytest.mark.processes
 def test_a_toy_metric_is_one_entry(scored):
     """In a fresh interpreter: results are made of the entries that there are when they are first
     imported."""

@@ -68,6 +68,7 @@ def averages(rows, average):
     return {key: average(values) for key, values in scores.items() if values}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("target", ["depth", "depth_exact"])
 def test_every_score_of_an_evaluation(target, dataset, tmp_path):
     folder = write(tmp_path / "p", dataset)

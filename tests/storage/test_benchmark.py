@@ -139,6 +139,7 @@ def test_settings_of_ones_own_are_no_benchmark():
         assert as_expected and sentence.startswith("a dataset of its own")
 
 
+@pytest.mark.long
 def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     settings, folder = tiny_settings(objects=("cork",)), tmp_path / "data"
     manifest = build(folder, settings, workers=1)

@@ -117,6 +117,7 @@ def test_memory_is_the_files_own_map(tiny):
         assert len(holder) == 1 and str(tiny) in holder[0]
 
 
+@pytest.mark.long
 def test_new_data_in_the_same_folder_is_not_read_out_of_the_old_cache(tmp_path):
     folder = tmp_path / "set"
     frames = []

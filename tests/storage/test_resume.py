@@ -383,6 +383,7 @@ def test_files_that_can_not_grow(tmp_path, direct_light, uninterrupted):
     assert file_bytes(folder) == uninterrupted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["README.md", "manifest.json", "state.json"])
 def test_disk_that_is_full_at_the_very_end(tmp_path, uninterrupted, monkeypatch, name):
     """No space for a small file: the card, the manifest, a state file."""

@@ -42,6 +42,7 @@ def reseal(folder, shard):
     )
 
 
+@pytest.mark.long
 def test_clean_datasets_have_no_findings(tiny, clean):
     reported = []
     assert verify(tiny, reported.append) == [] and verify(clean) == []
@@ -54,6 +55,7 @@ def test_clean_datasets_have_no_findings(tiny, clean):
 # ---- files
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.0, 0.999999])
 def test_flipped_byte_in_a_shard(copied, share, capsys):
     path = copied / shard_of(copied, "validation", "codes").path
@@ -266,6 +268,7 @@ def test_every_kind_of_tampering_with_the_manifest_is_noticed(clean):
         assert "manifest.json" in refusal(fpp_bench, "verify", clean)
 
 
+@pytest.mark.long
 def test_any_flipped_bit_of_the_manifest_is_noticed_or_does_not_concern_the_data(clean):
     path = clean / "manifest.json"
     content, manifest = path.read_bytes(), read_manifest(clean)

@@ -139,6 +139,7 @@ def test_a_gan_paused_is_the_same_too(tmp_path, trained):
     assert {"discriminator", "feature_matching", "hybrid_l1"} <= set(curve_of(whole)[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["guided", "physics"])
 def test_further_directions_train(name, tmp_path, trained):
     (record,) = curve_of(trained(tmp_path / "run", small(f"further/{name}", max_epochs=1)))
@@ -195,6 +196,7 @@ def test_the_validation_score_is_the_evaluators(tiny, tmp_path, normalisation, t
     assert logged["validation_loss"] == pytest.approx(loss, rel=FLOAT32)
 
 
+@pytest.mark.long
 def test_many_frames_and_bf16(tmp_path, trained):
     recipe = small("multi_frame/vertical", precision="bf16", max_epochs=1)
     run = trained(tmp_path / "run", recipe, show=True)
@@ -351,6 +353,7 @@ def test_a_linear_schedule_is_constant_and_then_falls_to_zero():
     assert rates == pytest.approx([1e-4, 1e-4, 1e-4, 0.75e-4, 0.5e-4, 0.25e-4])
 
 
+@pytest.mark.long
 def test_the_rule_of_the_range_is_recorded_and_a_run_of_another_is_not_continued(tmp_path, trained):
     """Runs of before the rule hold none; their range was that of all object pixels."""
     recipe = small("normalization/individual", max_epochs=2)

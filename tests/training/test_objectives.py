@@ -197,6 +197,7 @@ def test_frozen_parameters_stay_frozen_and_free_ones_are_freed_after_an_error():
     ] * 11
 
 
+@pytest.mark.long
 def test_the_discriminator_learns_on_two_fixed_distributions():
     """A generator that stands still: the loss must fall from guessing (0.5 with two scales) to
     telling them apart."""
@@ -219,6 +220,7 @@ def test_the_discriminator_learns_on_two_fixed_distributions():
                 assert scale[-1].mean().item() == pytest.approx(expected, abs=0.3)
 
 
+@pytest.mark.long
 def test_the_generator_learns_from_the_discriminator_alone():
     """Without depth terms, the only way to fool the discriminator is a depth that looks like the
     batch's."""

@@ -35,6 +35,7 @@ def views():
     ]  # it uses its arrays again
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", shipped_names())
 def test_each_is_its_recipe_and_gives_the_score_of_its_row(name, views):
     """Against the leaderboard's row of the same weights, whose scores come from the full set."""

@@ -33,6 +33,7 @@ def job(ways, data, tmp_path, **changes):
     return ways.Job(**{"data": data, "scratch": tmp_path, **told, **changes})
 
 
+@pytest.mark.long
 def test_both_ways_read_the_same_images(monkeypatch, ways, data):
     train_speed.check_same(*data)
     monkeypatch.setattr(ways.PngAndMat, "__len__", lambda self: 5)
@@ -40,6 +41,7 @@ def test_both_ways_read_the_same_images(monkeypatch, ways, data):
         train_speed.check_same(*data)
 
 
+@pytest.mark.long
 def test_a_difference_is_noticed(ways, data):
     dataset, tree = data
     reader = ways.PngAndMat(tree)
@@ -57,6 +59,7 @@ def test_a_difference_is_noticed(ways, data):
         reader.depths[2].write_bytes(content)
 
 
+@pytest.mark.long
 def test_an_epoch_of_each(ways, data, tmp_path):
     """From the same weights, over the same six pairs in orders of their own: nearly the same
     loss."""
